@@ -1,0 +1,183 @@
+"""Settings: layering, one clear sentence for every bad key and value, and the written file reads back the same."""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+
+from nerfvol.config import (
+    Colour,
+    Count,
+    assemble,
+    colour,
+    parse_assignment,
+    positive,
+    read_yaml,
+    seconds,
+    to_plain,
+    write_yaml,
+)
+from nerfvol.errors import InputError
+
+
+@dataclass(frozen=True)
+class Stage:
+    resolution: int = 64
+    until: float = 1.0
+
+
+@dataclass
+class Section:
+    rate: float = 0.3
+    levels: int = 3
+    widths: tuple[int, ...] = (4, 8)
+    aabb: tuple[float, float, float] | None = None
+    stages: tuple[Stage, ...] = (Stage(),)
+    weights: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.levels > 16:
+            raise InputError(f"levels must be at most 16, got {self.levels}")
+
+
+@dataclass
+class Settings:
+    data: str = ""
+    mode: Literal["mlp", "direct"] = "direct"
+    budget: Annotated[float | None, seconds] = 300.0
+    background: Colour = (1.0, 1.0, 1.0)
+    downscale: Count = 1
+    resume: bool = False
+    folder: Path = Path(".")
+    names: list[str] = dataclasses.field(default_factory=list)
+    section: Section = dataclasses.field(default_factory=Section)
+
+
+def build(mapping, *more):
+    return assemble(Settings, (mapping, "a.yaml"), *more)
+
+
+def test_layers_override_key_by_key():
+    settings = build({"section": {"rate": 0.1, "levels": 5}, "data": "x"}, ({"section": {"levels": 7}}, "command line"))
+    assert (settings.data, settings.section.rate, settings.section.levels, settings.mode) == ("x", 0.1, 7, "direct")
+    assert Settings().section.levels == 3  # defaults are not shared
+
+
+def test_every_kind_of_value():
+    settings = build(
+        {
+            "budget": "5m", "background": "0.5, 0,1", "downscale": 4.0, "resume": "yes", "folder": "/tmp",
+            "names": ["a", "b"],
+            "section": {
+                "rate": "1e-3", "widths": [1, 2, 3], "aabb": [0, 1, 2], "weights": {"tv": 1},
+                "stages": [{"resolution": 32}, {"until": 0.5}],
+            },
+        }
+    )  # fmt: skip
+    assert settings.budget == 300 and settings.background == (0.5, 0, 1) and settings.downscale == 4
+    assert settings.resume is True and settings.folder == Path("/tmp") and settings.names == ["a", "b"]
+    section = settings.section
+    assert section.rate == 1e-3 and section.widths == (1, 2, 3) and section.aabb == (0.0, 1.0, 2.0)
+    assert section.stages == (Stage(32), Stage(until=0.5)) and section.weights == {"tv": 1.0}
+    assert isinstance(section.aabb[0], float)
+
+
+@pytest.mark.parametrize(
+    "mapping, sentence",
+    [
+        ({"backgroud": "white"}, "a.yaml: unknown key 'backgroud'; did you mean 'background'?"),
+        ({"section": {"level": 1}}, "a.yaml: unknown key 'section.level'; did you mean 'section.levels'?"),
+        ({"section": {"stages": [{"resolutoin": 1}]}}, "unknown key 'resolutoin'; did you mean 'resolution'?"),
+        ({"section": 3}, "a.yaml: section is a section, expected keys and values, got 3"),
+        ({"section": None}, "section is a section"),
+        ({"mode": "nerf"}, "a.yaml: mode: expected mlp or direct, got 'nerf'"),
+        ({"section": {"levels": 1.5}}, "a.yaml: section.levels: expected a whole number, got 1.5"),
+        ({"section": {"levels": True}}, "section.levels: expected a whole number, got True"),
+        ({"section": {"rate": "fast"}}, "section.rate: expected a number, got 'fast'"),
+        ({"section": {"rate": float("nan")}}, "section.rate: expected a number"),
+        ({"section": {"rate": 10**400}}, "section.rate: expected a number"),
+        ({"section": {"aabb": [1, 2]}}, "section.aabb: expected a list of 3, got 2"),
+        ({"section": {"aabb": 5}}, "section.aabb: expected a list, got 5"),
+        ({"section": {"weights": 5}}, "section.weights: expected keys and values, got 5"),
+        ({"section": {"levels": 17}}, "a.yaml: levels must be at most 16, got 17"),
+        ({"resume": 2}, "resume: expected true or false, got 2"),
+        ({"data": 3}, "data: expected text, got 3"),
+        ({"downscale": 0}, "downscale: expected a number of at least 1, got 0"),
+        ({"budget": "5 minutes"}, "budget: expected a duration such as 120s, 5m or 1h"),
+        ({"budget": -3}, "budget: expected a duration"),
+        ({"background": "grey"}, "background: expected white, black or R,G,B with numbers from 0 to 1, got 'grey'"),
+        ({"background": "255,255,255"}, "background: expected white, black or R,G,B"),
+        ({3: 4}, "unknown key '3'"),
+    ],
+)
+def test_one_clear_sentence(mapping, sentence):
+    with pytest.raises(InputError) as error:
+        build(mapping)
+    assert sentence in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text, value", [("120s", 120), ("5m", 300), ("1.5h", 5400), (7, 7), ("none", None)])
+def test_seconds(text, value):
+    assert seconds(text) == value
+
+
+@pytest.mark.parametrize("bad", ["", "0s", "nan", "inf", "s", True, "1d", [1]])
+def test_bad_seconds(bad):
+    if bad == "":
+        assert seconds(bad) is None
+        return
+    with pytest.raises(ValueError, match="duration"):
+        seconds(bad)
+
+
+def test_colour_and_positive():
+    assert colour("White") == (1, 1, 1) and colour("black") == (0, 0, 0) and colour([0, 0.5, 1]) == (0, 0.5, 1)
+    for bad in ("1,1", "1,1,1,1", "a,b,c", None, 3, "nan,0,0", [2, 0, 0]):
+        with pytest.raises(ValueError, match="white, black"):
+            colour(bad)
+    assert positive(1) == 1 and positive("word") == "word"
+
+
+def test_written_file_reads_back_the_same(tmp_path):
+    section = {"stages": [{"until": 0.25}], "aabb": [1, 2, 3]}
+    settings = build({"background": "black", "section": section, "data": "é x"})
+    write_yaml(tmp_path / "config.yaml", settings)
+    assert assemble(Settings, (read_yaml(tmp_path / "config.yaml"), "file")) == settings
+    assert to_plain(settings)["section"]["stages"] == [{"resolution": 64, "until": 0.25}]
+
+
+@pytest.mark.parametrize(
+    "content, reason",
+    [
+        (b"a: [1", "line"),
+        (b"- 1\n- 2\n", "expected keys and values, got a list"),
+        (b"\xff\xfe\x00", "UTF-8"),
+        (b"!!python/object/apply:os.system ['true']", "could not determine a constructor"),
+        (b"[" * 50_000, "nested too deeply|not a config"),
+        (b"a: &a [*a]\nb: \t- x", "not a config file"),
+    ],
+)
+def test_bad_yaml(tmp_path, content, reason):
+    path = tmp_path / "bad.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=reason) as error:
+        read_yaml(path)
+    assert "bad.yaml" in str(error.value)
+
+
+def test_empty_and_missing_yaml(tmp_path):
+    (tmp_path / "empty.yaml").write_text("# nothing\n")
+    assert read_yaml(tmp_path / "empty.yaml") == {}
+    with pytest.raises(InputError, match="no such file"):
+        read_yaml(tmp_path / "none.yaml")
+
+
+def test_assignments():
+    assert parse_assignment("section.levels=4") == {"section": {"levels": 4}}
+    assert parse_assignment("data=a=b") == {"data": "a=b"}
+    for bad in ("levels", "=3", "a..b=1", "a-b=1", "x=[1"):
+        with pytest.raises(InputError, match="--set"):
+            parse_assignment(bad)
