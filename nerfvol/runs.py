@@ -1,0 +1,74 @@
+"""The run folder: what lies where, what a RUN|FILE argument means, and how an earlier run in the way is kept."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from nerfvol.config import Config, read_yaml, write_yaml
+from nerfvol.errors import InputError
+from nerfvol.files import ensure_writable_folder, explain_os_error
+
+CONFIG = "config.yaml"
+OCTREE = "octree.safetensors"
+CHECKPOINT = "checkpoint.safetensors"
+METRICS = "metrics.json"
+LOG = "log.jsonl"
+PREVIEWS = "previews"
+PREVIOUS = "previous"
+
+
+def octree_path(target: str | os.PathLike[str]) -> Path:
+    """The octree file that RUN|FILE means; a missing one is an InputError that says what was looked for."""
+    path = Path(target)
+    if path.is_dir():
+        found = path / OCTREE
+        if not found.is_file():
+            raise InputError(f"{path} holds no {OCTREE}: it is no finished run folder")
+        return found
+    if not path.exists():
+        raise InputError(f"no such run folder or octree file: {path}")
+    return path
+
+
+def run_settings(target: str | os.PathLike[str]) -> dict[str, Any]:
+    """The settings written in the run folder of RUN|FILE; empty where the file stands alone."""
+    path = Path(target)
+    config = (path if path.is_dir() else path.parent) / CONFIG
+    return read_yaml(config) if config.is_file() else {}
+
+
+def resumable_config(run: str | os.PathLike[str]) -> Path:
+    """RUN/config.yaml of a run that can be resumed."""
+    config, checkpoint = Path(run) / CONFIG, Path(run) / CHECKPOINT
+    for path in (config, checkpoint):
+        if not path.is_file():
+            raise InputError(f"--resume: {run} holds no {path.name}, so there is nothing to resume")
+    return config
+
+
+def prepare(config: Config) -> Path:
+    """Make the run folder, prove that it can be written, put an earlier run aside and write the resolved config.
+
+    An earlier run in the same folder moves to RUN/previous (one generation is kept), unless this run resumes it.
+    """
+    run = ensure_writable_folder(config.out)
+    if not config.resume:
+        _set_aside(run)
+    write_yaml(run / CONFIG, config)
+    return run
+
+
+def _set_aside(run: Path) -> None:
+    old = [run / name for name in (CONFIG, OCTREE, CHECKPOINT, METRICS, LOG) if (run / name).is_file()]
+    if not old:
+        return
+    previous = ensure_writable_folder(run / PREVIOUS)
+    try:
+        for name in (CONFIG, OCTREE, CHECKPOINT, METRICS, LOG):  # a file of the generation before must not mix with it
+            (previous / name).unlink(missing_ok=True)
+        for path in old:
+            os.replace(path, previous / path.name)
+    except OSError as error:
+        raise InputError(f"cannot move the earlier run to {previous}: {explain_os_error(error)}") from error
