@@ -6,7 +6,7 @@ coordinates; ``sigma`` is in 1/u of the scene; colour is 1/2 + sum_k sh_k Y_k(d)
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from nerfvol import sh as spherical
 from nerfvol.encodings import FrequencyEncoding, HashGrid
+from nerfvol.errors import InputError
 
 
 @runtime_checkable
@@ -54,7 +55,7 @@ class FieldShape:
     density_bias: added to the raw density; negative = the field starts as thin haze.
     """
 
-    encoding: str = "hash"
+    encoding: Literal["hash", "frequency"] = "hash"
     n_frequencies: int = 10
     n_frequencies_dir: int = 4
     hash_levels: int = 8
@@ -65,10 +66,23 @@ class FieldShape:
     width: int = 64
     depth: int = 1
     skip: int = 0
-    head: str = "sh"
+    head: Literal["sh", "rgb"] = "sh"
     sh_degree: int = 1
-    density: str = "exp"
+    density: Literal["exp", "softplus"] = "exp"
     density_bias: float = 0.0
+
+    def __post_init__(self) -> None:
+        if min(self.width, self.depth) < 1 or not 0 <= self.skip < self.depth:
+            sizes = f"{self.width}, {self.depth}, {self.skip}"
+            raise InputError(f"a field needs width, depth >= 1 and 0 <= skip < depth, got {sizes}")
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"the sh_degree of a field must be 0 to 3, got {self.sh_degree}")
+        if min(self.n_frequencies, self.n_frequencies_dir) < 0:
+            raise InputError("the number of frequencies of an encoding must not be negative")
+        if min(self.hash_levels, self.hash_features, self.hash_min) < 1 or self.hash_max < self.hash_min:
+            raise InputError("a hash grid needs hash_levels, hash_features, hash_min >= 1 and hash_max >= hash_min")
+        if not 4 <= self.hash_log2_table <= 24:
+            raise InputError(f"hash_log2_table must be 4 to 24, got {self.hash_log2_table}")
 
 
 @dataclass(frozen=True)
@@ -153,7 +167,6 @@ class NeuralField(nn.Module):
 
     def __init__(self, domain: Domain, shape: FieldShape, encoding: nn.Module) -> None:
         super().__init__()
-        _check_shape(shape)
         self.domain, self.shape, self.encoding = domain, shape, encoding
         self.sh_degree = shape.sh_degree if shape.head == "sh" else 0
         self.trunk = _Trunk(encoding.out_dim, shape.width, shape.depth, shape.skip)
@@ -230,14 +243,3 @@ def make_field(domain: Domain, shape: FieldShape, seed: int = 0) -> NeuralField:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return kinds[shape.encoding](domain, shape)
-
-
-def _check_shape(shape: FieldShape) -> None:
-    for name, allowed in {"head": ("sh", "rgb"), "density": ("exp", "softplus")}.items():
-        if getattr(shape, name) not in allowed:
-            raise ValueError(f"{name} must be one of {allowed}, got {getattr(shape, name)!r}")
-    if shape.head == "sh":
-        spherical.basis_dim(shape.sh_degree)
-    if shape.width < 1 or shape.depth < 1 or not 0 <= shape.skip < shape.depth:
-        sizes = f"{shape.width}, {shape.depth}, {shape.skip}"
-        raise ValueError(f"need width, depth >= 1 and 0 <= skip < depth, got {sizes}")
