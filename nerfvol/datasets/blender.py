@@ -1,0 +1,208 @@
+"""``transforms*.json``: NeRF-synthetic (Blender), instant-ngp and nerfstudio.
+
+The three share one layout: calibration at the top or in each frame (a frame's own figures win), ``file_path`` and a
+camera-to-world ``transform_matrix`` in OpenGL axes. Formats and sources: docs/data.md.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfvol.cameras import Camera, rigid_pose
+from nerfvol.datasets.bounds import BoundsHint
+from nerfvol.datasets.frames import Calibration, Frame, ImageFinder, Listing, hold_out
+from nerfvol.errors import InputError
+
+_SPLITS = ("train", "val", "test")
+_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+
+
+def is_transforms_folder(folder: Path) -> bool:
+    """Whether the folder holds a transforms*.json this module reads."""
+    return any((folder / name).is_file() for name in ("transforms.json", *(f"transforms_{s}.json" for s in _SPLITS)))
+
+
+def read_transforms(path: Path, split: str) -> Listing:
+    """The listing of one split of a folder with transforms*.json, or of one such file.
+
+    transforms_{train,val,test}.json are used as they are; where only one of val and test exists it stands for both. A
+    single transforms.json is split by its own train/val/test_filenames or, without them, by holding out every 8th view.
+    """
+    if path.is_file():
+        return _read_single(path, split)
+    files = {s: path / f"transforms_{s}.json" for s in _SPLITS if (path / f"transforms_{s}.json").is_file()}
+    if not files:
+        return _read_single(path / "transforms.json", split)
+    if "val" not in files and "test" not in files:
+        return _read_single(files["train"], split)
+    messages = []
+    other = {"val": "test", "test": "val"}.get(split)
+    if split not in files and other is not None and other in files:
+        messages.append(f"there is no transforms_{split}.json: the {other} views are used instead")
+        files[split] = files[other]
+    if split not in files:
+        raise InputError(f"{path}: expected transforms_{split}.json for the {split} views, but there is no such file")
+    frames, hint = _read_file(files[split])
+    training, hint = _read_file(files["train"]) if "train" in files and split != "train" else (frames, hint)
+    return Listing(frames, training, files[split], hint, messages)
+
+
+def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:
+    """The cameras of a transforms*.json alone, for a path to render: images are not looked for.
+
+    ``size`` (width, height) is needed where the file states no w and h; where it does, it asks for another size.
+    """
+    cameras = []
+    for frame in _read_file(path)[0]:
+        stated = (frame.calibration.width, frame.calibration.height)
+        known = stated if None not in stated else size
+        if known is None:
+            raise InputError(f"{path}: the image size is missing: expected w and h in the file, or a size to render at")
+        try:
+            camera = Camera(frame.calibration.intrinsics(*known), frame.c2w)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        cameras.append(camera if size is None else camera.resized(*size))
+    return cameras
+
+
+def _read_single(path: Path, split: str) -> Listing:
+    data = _load_json(path)
+    frames, hint = _parse(data, path)
+    present = [frame for frame in frames if frame.path is not None]
+    missing = [frame for frame in frames if frame.path is None]
+    named = {s: data[f"{s}_filenames"] for s in _SPLITS if data.get(f"{s}_filenames")}
+    if "train" in named and ("val" in named or "test" in named):
+        wanted = named.get(split) or named.get("test") or named.get("val")
+        chosen = [f for f in present if f.listed in wanted]
+        training = [f for f in present if f.listed in named["train"]]
+        return Listing(chosen + [f for f in missing if f.listed in wanted], training, path, hint)
+    if not present:
+        return Listing(frames, frames, path, hint)
+    chosen, training, sentence = hold_out(present, split)
+    return Listing(chosen + missing, training, path, hint, [sentence])
+
+
+def _read_file(path: Path) -> tuple[list[Frame], BoundsHint]:
+    return _parse(_load_json(path), path)
+
+
+def _load_json(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected a transforms*.json with camera poses, but there is no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected JSON text, but it cannot be read ({error})") from error
+    try:
+        data = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: expected JSON, but it does not parse ({error})") from error
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+        raise InputError(f'{path}: expected a JSON object with a non-empty list "frames"')
+    return data
+
+
+def _parse(data: Mapping[str, Any], path: Path) -> tuple[list[Frame], BoundsHint]:
+    finder = ImageFinder(path.parent)
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    frames = []
+    for number, entry in enumerate(data["frames"]):
+        where = f"{path}, frame {number}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where}: expected an object with file_path and transform_matrix, got {entry!r:.40}")
+        listed = entry.get("file_path")
+        if not isinstance(listed, str) or not listed or "\0" in listed:
+            raise InputError(f"{where}: expected file_path to name an image, got {listed!r:.40}")
+        where = f"{where} ({listed})"
+        if "transform_matrix" not in entry:
+            raise InputError(f"{where}: transform_matrix is missing")
+        try:
+            c2w = rigid_pose(_matrix(entry["transform_matrix"]))
+            calibration = _calibration({**shared, **entry})
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        frames.append(Frame(listed, finder.find(listed), c2w, calibration))
+    try:
+        return frames, _hint(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _matrix(value: Any) -> np.ndarray:
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"transform_matrix must be 4 rows of 4 numbers, got {value!r:.60}") from None
+
+
+def _number(data: Mapping[str, Any], *keys: str) -> float | None:
+    """The first of the keys that is there, as a finite number."""
+    for key in keys:
+        value = data.get(key)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"{key} must be a finite number, got {value!r:.40}")
+        return float(value)
+    return None
+
+
+def _calibration(data: Mapping[str, Any]) -> Calibration:
+    model = data.get("camera_model", "OPENCV")
+    if model not in _PINHOLE_MODELS + _FISHEYE_MODELS:
+        known = ", ".join(_PINHOLE_MODELS + _FISHEYE_MODELS)
+        raise InputError(f"camera_model {model!r:.40} is not supported; known models: {known}")
+    unsupported = [key for key in ("ftheta_p0", "latlong", "equirectangular") if data.get(key)]
+    if unsupported:
+        raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
+    fisheye = model in _FISHEYE_MODELS or data.get("is_fisheye") is True
+    coefficients = [_number(data, key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    if fisheye:
+        coefficients[4:] = [0.0, 0.0]  # the model has no tangential part; exporters write zeros or leftovers there
+    degrees = {key: _number(data, key) for key in ("x_fov", "y_fov")}
+    angles = [None if v is None else math.radians(v) for v in degrees.values()]
+    width, height = (_size(data, key) for key in ("w", "h"))
+    return Calibration(
+        width=width, height=height, fx=_number(data, "fl_x"), fy=_number(data, "fl_y"),
+        angle_x=_number(data, "camera_angle_x") if angles[0] is None else angles[0],
+        angle_y=_number(data, "camera_angle_y") if angles[1] is None else angles[1],
+        cx=_number(data, "cx"), cy=_number(data, "cy"), distortion=tuple(coefficients), fisheye=fisheye,
+    )
+
+
+def _size(data: Mapping[str, Any], key: str) -> int | None:
+    value = _number(data, key)
+    if value is not None and (value < 1 or value != int(value)):
+        raise InputError(f"{key} must be a whole number of pixels, got {value:g}")
+    return None if value is None else int(value)
+
+
+def _hint(data: Mapping[str, Any]) -> BoundsHint:
+    aabb = data.get("aabb")
+    if aabb is not None:
+        try:
+            aabb = np.array(aabb, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise InputError(f"aabb must be two corners of three numbers, got {aabb!r:.60}") from None
+    scale = _number(data, "aabb_scale")
+    if scale is not None and scale <= 0:
+        raise InputError(f"aabb_scale must be positive, got {scale:g}")
+    return BoundsHint(aabb=aabb, aabb_scale=scale)
+
+
+def listed_names(frames: Sequence[Frame]) -> list[str]:
+    """One unique name a frame, fit for a file name: the image's stem, or its path with _ for / where stems repeat."""
+    paths = [Path(frame.listed.replace("\\", "/")) for frame in frames]
+    stems = [p.stem if p.suffix else p.name for p in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    long = ["_".join(part for part in p.with_suffix("").parts if part not in (".", "..", "/")) for p in paths]
+    return [f"{i:04d}_{name}" for i, name in enumerate(long)] if len(set(long)) < len(long) else long

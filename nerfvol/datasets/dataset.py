@@ -1,0 +1,88 @@
+"""What every loader returns: cameras, compact images, where the scene is, and what there was to say about the files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nerfvol.cameras import Camera
+from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads
+from nerfvol.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBounds:
+    """Where the scene is, in scene units.
+
+    ``aabb`` (2, 3) float64, lowest and highest corner: the region of detail.
+    ``background_cube`` (2, 3) or None: the larger cube, concentric with ``aabb``, that holds the surroundings of
+    photographs; None where the background is not part of the scene.
+    ``has_alpha``: the images have transparent pixels, seen over whatever background is asked for.
+    """
+
+    aabb: NDArray[np.float64]
+    background_cube: NDArray[np.float64] | None
+    has_alpha: bool
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "aabb", check_box(self.aabb, "the scene's aabb"))
+        if self.background_cube is not None:
+            object.__setattr__(self, "background_cube", check_box(self.background_cube, "the background cube"))
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) the middle of the region of detail."""
+        return self.aabb.mean(axis=0)
+
+
+def check_box(box: ArrayLike, what: str) -> NDArray[np.float64]:
+    """The box (2, 3) float64 from (2, 3) or six numbers; InputError unless finite and not empty on any axis."""
+    corners = np.asarray(box, dtype=np.float64)
+    if corners.size != 6:
+        raise InputError(f"{what} must be two corners of three numbers, got shape {corners.shape}")
+    corners = corners.reshape(2, 3).copy()
+    if not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
+        raise InputError(f"{what} must be finite with its first corner below the second, got {corners.tolist()}")
+    return corners
+
+
+@dataclass(eq=False)
+class Dataset:
+    """Posed images of one split.
+
+    ``images``: uint8 arrays, (h, w, 3) or (h, w, 4) with straight alpha, as large as their camera's intrinsics say.
+    ``names``: one a view, unique, fit for a file name. ``source``: the file the poses came from.
+    ``messages``: sentences a person should see (frames left out, how the split was made, how the bounds were found).
+    """
+
+    cameras: list[Camera]
+    images: list[UInt8]
+    names: list[str]
+    scene: SceneBounds
+    source: str
+    messages: list[str] = field(default_factory=list)
+    threads: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes the images hold."""
+        return sum(image.nbytes for image in self.images)
+
+    def composited(self, i: int, background: Sequence[float]) -> NDArray[np.float32]:
+        """Image i over a background (3,) in [0, 1]: float32 (h, w, 3) in [0, 1]."""
+        return composite(self.images[i], background)
+
+    def pyramid(self, background: Sequence[float], k: int) -> list[UInt8]:
+        """Every image over a background (3,) in [0, 1], area-averaged over k x k pixels: uint8 (h // k, w // k, 3).
+
+        Their cameras are ``camera.scaled(k)``. Opaque images at k = 1 are returned themselves, not copied.
+        """
+        if not 1 <= k <= 256:
+            raise InputError(f"the pyramid's factor must be an integer between 1 and 256, got {k}")
+        return map_threads(lambda image: composite_average(image, background, k), self.images, self.threads)

@@ -1,0 +1,135 @@
+"""What a format reader hands over: a listing of posed image files, before any image is decoded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras import Intrinsics
+from nerfvol.datasets.bounds import BoundsHint
+from nerfvol.datasets.images import SUFFIXES
+from nerfvol.errors import InputError
+
+HOLD_OUT_EVERY = 8
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Intrinsics as a file states them; what it leaves open (None) follows from the image's size.
+
+    ``resizable``: the figures are for the original photographs and the folder may hold them uniformly resized;
+    otherwise an image of another size than (width, height) is an error.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    fx: float | None = None
+    fy: float | None = None
+    angle_x: float | None = None
+    angle_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    distortion: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    fisheye: bool = False
+    resizable: bool = False
+
+    def intrinsics(self, width: int, height: int) -> Intrinsics:
+        """The intrinsics of an image of width x height pixels."""
+        sx, sy = self._resize(width, height)
+        fx = self.fx * sx if self.fx is not None else _focal(self.angle_x, width)
+        fy = self.fy * sy if self.fy is not None else _focal(self.angle_y, height)
+        if fx is None and fy is None:
+            raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
+        fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)  # square pixels where only one is given
+        cx = 0.5 * width if self.cx is None else self.cx * sx
+        cy = 0.5 * height if self.cy is None else self.cy * sy
+        return Intrinsics(width, height, fx, fy, cx, cy, *self.distortion, fisheye=self.fisheye)
+
+    def _resize(self, width: int, height: int) -> tuple[float, float]:
+        stated = (self.width or width, self.height or height)
+        if stated == (width, height):
+            return 1.0, 1.0
+        sx, sy = width / stated[0], height / stated[1]
+        # a resized side is rounded to whole pixels: the two scales agree to about a pixel over the smaller image
+        if self.resizable and abs(sx - sy) * min(stated) <= 2:
+            return sx, sy
+        expected = f"{stated[0]}x{stated[1]} pixels as its calibration states"
+        raise InputError(f"expected an image of {expected}, got {width}x{height}")
+
+
+def _focal(angle: float | None, size: int) -> float | None:
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise InputError(f"the field of view must be between 0 and pi radians, got {angle:g}")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One listed image: as named by the file, where it is on disk (None if missing), its pose and calibration."""
+
+    listed: str
+    path: Path | None
+    c2w: NDArray[np.float64]
+    calibration: Calibration
+
+
+@dataclass(eq=False)
+class Listing:
+    """The frames of one split, and of the training split (from which the scene bounds are worked out)."""
+
+    frames: list[Frame]
+    training: list[Frame]
+    source: Path
+    hint: BoundsHint = field(default_factory=BoundsHint)
+    messages: list[str] = field(default_factory=list)
+
+
+def hold_out(frames: list[Frame], split: str) -> tuple[list[Frame], list[Frame], str]:
+    """The built-in split where a file has none: frames of the split, training frames, a sentence.
+
+    In the order of their names every 8th frame, beginning with the first, is held out, for validation and test alike:
+    the field's convention for photo sets.
+    """
+    ordered = sorted(frames, key=lambda frame: frame.listed)
+    held, kept = ordered[::HOLD_OUT_EVERY], [f for i, f in enumerate(ordered) if i % HOLD_OUT_EVERY]
+    if not kept:
+        return ordered, ordered, "a single view: it is used for training and for validation"
+    share = f"{len(held)} of {len(ordered)}"
+    sentence = f"no split in the file: every {HOLD_OUT_EVERY}th view by name is held out ({share})"
+    return (kept if split == "train" else held), kept, sentence
+
+
+class ImageFinder:
+    """Finds image files as formats name them: relative to a folder, with or without the suffix, in any case."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._listings: dict[Path, dict[str, Path]] = {}
+
+    def find(self, listed: str) -> Path | None:
+        """The file, or None if there is none."""
+        path = self._folder / listed.replace("\\", "/")
+        names = self._names(path.parent)
+        if path.name in names or path.name.lower() in names:
+            found = path if path.is_file() else names[path.name.lower()]
+            return found if found.is_file() else None
+        stem = path.name.lower()
+        for suffix in SUFFIXES:
+            if stem + suffix in names:
+                return names[stem + suffix]
+        return None
+
+    def _names(self, folder: Path) -> dict[str, Path]:
+        if folder not in self._listings:
+            try:
+                entries = sorted(folder.iterdir())
+            except OSError:  # a folder that is not there holds no images; the caller reports them as missing
+                entries = []
+            self._listings[folder] = {entry.name.lower(): entry for entry in entries}
+        return self._listings[folder]

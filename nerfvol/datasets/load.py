@@ -1,0 +1,140 @@
+"""``load_dataset``: finds the format, reads the listing, decodes the images and works out the scene bounds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nerfvol.cameras import Camera
+from nerfvol.datasets.blender import is_transforms_folder, listed_names, read_transforms
+from nerfvol.datasets.bounds import cube, estimate_bounds, require_seen
+from nerfvol.datasets.dataset import Dataset, SceneBounds, check_box
+from nerfvol.datasets.frames import Frame, Listing
+from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
+from nerfvol.errors import InputError
+
+SPLITS = ("train", "val", "test")
+
+
+def load_dataset(
+    path: str | os.PathLike[str], split: str = "train", downscale: int = 1,
+    scene_override: SceneBounds | ArrayLike | None = None, threads: int | None = None,
+) -> Dataset:
+    """Loads one split of a folder of posed images, whatever its format (docs/data.md).
+
+    Args:
+        path: a folder with transforms*.json and images, or one such json file.
+        split: "train", "val" or "test".
+        downscale: area-averages the images (premultiplied by alpha) over downscale x downscale pixels.
+        scene_override: bounds to use instead of those worked out: a SceneBounds, or the region of detail as six numbers
+            (x0, y0, z0, x1, y1, z1) or (2, 3).
+        threads: threads that decode; one for every core by default.
+
+    Raises:
+        InputError: where the files cannot be used, in one sentence that names the file.
+    """
+    if split not in SPLITS:
+        raise InputError(f"the split must be one of {', '.join(SPLITS)}, got {split!r}")
+    if not isinstance(downscale, int) or not 1 <= downscale <= 256:
+        raise InputError(f"downscale must be an integer between 1 and 256, got {downscale!r}")
+    listing = _read_listing(Path(path), split)
+    messages = list(listing.messages)
+    frames = _present(listing, messages)
+    sizes = map_threads(lambda frame: image_size(frame.path), frames, threads)
+    full_size = [_camera(frame, size, listing.source) for frame, size in zip(frames, sizes, strict=True)]
+    cameras = [camera.scaled(downscale) for camera in full_size]
+    _require_memory(cameras, downscale)
+
+    images = map_threads(lambda frame: area_average(read_image(frame.path), downscale), frames, threads)
+    for frame, image, camera in zip(frames, images, cameras, strict=True):
+        if image.shape[:2] != (camera.intrinsics.height, camera.intrinsics.width):
+            raise InputError(f"{frame.path}: the image is not of the size its header declares")
+    images, has_alpha = _settle_alpha(images, listing.source)
+    training = [f for f in listing.training if f.path is not None] or frames
+    scene, sentence = _bounds(listing, training, scene_override, has_alpha)
+    require_seen(scene, cameras)
+    messages.append(sentence)
+    return Dataset(cameras, images, listed_names(frames), scene, str(listing.source), messages, threads)
+
+
+def _read_listing(path: Path, split: str) -> Listing:
+    if not path.exists():
+        raise InputError(f"{path}: expected a folder with posed images, but there is no such folder")
+    if path.is_file() or is_transforms_folder(path):
+        return read_transforms(path, split)
+    raise InputError(f"{path}: expected posed images, but found no transforms.json or transforms_train.json")
+
+
+def _present(listing: Listing, messages: list[str]) -> list[Frame]:
+    """The frames whose image exists; the others are reported in a message."""
+    missing = [frame.listed for frame in listing.frames if frame.path is None]
+    present = [frame for frame in listing.frames if frame.path is not None]
+    if not present:
+        raise InputError(
+            f"{listing.source}: none of the {len(missing)} images it lists exists (the first is {missing[0]})"
+            if missing else f"{listing.source}: no images are left for this split"
+        )
+    if missing:
+        shown = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
+        messages.append(
+            f"{listing.source.name} lists {len(missing)} images that are not on disk; they are left out: {shown}"
+        )
+    return present
+
+
+def _camera(frame: Frame, size: tuple[int, int], source: Path) -> Camera:
+    try:
+        return Camera(frame.calibration.intrinsics(*size), frame.c2w)
+    except InputError as error:
+        raise InputError(f"{source}, frame {frame.listed}: {error}") from None
+
+
+def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
+    """Refuses a set of images that cannot fit in the machine's memory before any of it is decoded."""
+    need = sum(4 * camera.intrinsics.width * camera.intrinsics.height for camera in cameras)
+    try:
+        have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # a platform that does not tell; decode and see
+        return
+    if need > 0.8 * have:
+        factor = int(np.ceil(downscale * np.sqrt(need / (0.5 * have))))
+        raise InputError(
+            f"{len(cameras)} images need {need / 2**30:.1f} GiB and this machine has {have / 2**30:.1f} GiB of memory; "
+            f"use a downscale of {factor} or more"
+        )
+
+
+def _settle_alpha(images: list[UInt8], source: Path) -> tuple[list[UInt8], bool]:
+    """Drops alpha channels where no image of the split uses one; refuses a split in which nothing is visible."""
+    with_alpha = [image for image in images if image.shape[2] == 4]
+    if len(with_alpha) == len(images) and not any(image[..., 3].any() for image in images):
+        raise InputError(f"{source}: all {len(images)} images are fully transparent, so there is nothing to learn from")
+    if any(image[..., 3].min() < 255 for image in with_alpha):
+        return images, True
+    return [np.ascontiguousarray(image[..., :3]) for image in images], False
+
+
+def _bounds(
+    listing: Listing, training: list[Frame], override: SceneBounds | ArrayLike | None, has_alpha: bool
+) -> tuple[SceneBounds, str]:
+    if isinstance(override, SceneBounds):
+        return override, "scene bounds: as given"
+    if override is not None:
+        box = check_box(override, "the scene's aabb")
+        half = float((box[1] - box[0]).max() / 2)
+        return SceneBounds(box, None if has_alpha else cube(box.mean(axis=0), 16 * half), has_alpha), (
+            "scene bounds: the aabb as given"
+        )
+    sizes: dict[Path, tuple[int, int]] = {}
+    cameras = []
+    for frame in training:
+        stated = (frame.calibration.width, frame.calibration.height)
+        if None in stated or frame.calibration.resizable:
+            sizes[frame.path] = image_size(frame.path)
+        cameras.append(_camera(frame, sizes.get(frame.path, stated), listing.source))
+    return estimate_bounds(cameras, has_alpha, listing.hint)
+
