@@ -1,0 +1,123 @@
+"""Pictures and videos on disk: 8- and 16-bit PNG, float EXR, MP4. Every file is whole or absent.
+
+Colours of a radiance field live in the encoding of its training images (sRGB). A PNG holds them as they are; an EXR
+is linear by convention, so they are decoded with the sRGB curve on the way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.errors import InputError
+from nerfvol.files import atomic_write
+
+Float = NDArray[np.float32]
+
+
+def to_uint8(image: Float) -> NDArray[np.uint8]:
+    """Values in [0, 1] (clipped) rounded to 0...255."""
+    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def write_png(path: str | os.PathLike[str], image: NDArray[Any]) -> None:
+    """Write (H, W), (H, W, 3) or (H, W, 4) values in [0, 1] with 8 bits, or uint8/uint16 arrays as they are."""
+    from PIL import Image
+
+    pixels = image if image.dtype in (np.uint8, np.uint16) else to_uint8(image)
+    with atomic_write(path) as temporary:
+        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, format="PNG", compress_level=4)
+
+
+def srgb_to_linear(image: Float) -> Float:
+    """The sRGB decoding curve (IEC 61966-2-1); negative values keep their sign, values above 1 go on along it."""
+    magnitude = np.abs(image)
+    curve = np.where(magnitude <= 0.04045, magnitude / 12.92, ((magnitude + 0.055) / 1.055) ** 2.4)
+    return (np.sign(image) * curve).astype(np.float32)
+
+
+def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Float]) -> None:
+    """Write float32 ``channels`` to one EXR; "RGB" and "N" are (H, W, 3), the others (H, W), for example "A" and "Z".
+
+    "N" becomes N.X, N.Y, N.Z. Raises InputError where the OpenEXR package is missing.
+    """
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise InputError("writing EXR needs the package OpenEXR (pip install OpenEXR)") from error
+    arrays = {}
+    for name, array in channels.items():
+        array = np.ascontiguousarray(array, dtype=np.float32)
+        if name == "N":
+            arrays.update({f"N.{axis}": np.ascontiguousarray(array[..., i]) for i, axis in enumerate("XYZ")})
+        else:
+            arrays[name] = array
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_write(path) as temporary:
+        try:
+            OpenEXR.File(header, arrays).write(str(temporary))
+        except RuntimeError as error:  # the library's only word for a full disk
+            raise OSError(None, str(error).splitlines()[0], str(temporary)) from error
+
+
+class VideoWriter:
+    """Frames to an H.264 MP4 that every browser plays (yuv420p; odd sizes lose their last row or column)."""
+
+    def __init__(self, path: Path, fps: int):
+        import imageio.v2 as imageio
+
+        self._writer = imageio.get_writer(
+            path, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
+        )
+
+    def add(self, image: NDArray[Any]) -> None:
+        """Append an (H, W, 3) frame of values in [0, 1] or uint8."""
+        pixels = image if image.dtype == np.uint8 else to_uint8(image)
+        height, width = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
+        self._writer.append_data(np.ascontiguousarray(pixels[:height, :width]))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.close()
+
+
+@contextlib.contextmanager
+def open_video(path: str | os.PathLike[str], fps: int) -> Iterator[VideoWriter]:
+    """A :class:`VideoWriter` whose file appears at ``path`` when the block ends without an exception."""
+    with atomic_write(path) as temporary:
+        writer = VideoWriter(temporary, fps)
+        try:
+            yield writer
+        finally:
+            writer.close()
+
+
+def depth_to_grey(depth: Float, opacity: Float, near: float, far: float) -> Float:
+    """Distances as light: 1 at ``near``, 0.1 at ``far``, 0 where nothing was hit (opacity below one half)."""
+    nearness = 1.0 - 0.9 * np.clip((depth - near) / max(far - near, 1e-12), 0.0, 1.0)
+    return np.where(opacity >= 0.5, nearness, 0.0).astype(np.float32)
+
+
+def normal_to_rgb(normal: Float, opacity: Float) -> Float:
+    """World-space unit normals (H, W, 3) as the usual colours (n + 1) / 2; grey where there is none."""
+    return np.where(opacity[..., None] >= 0.5, 0.5 * normal + 0.5, 0.5).astype(np.float32)
+
+
+def error_map(truth: Float, render: Float, largest: float = 0.25) -> Float:
+    """|truth - render| (H, W, 3), the mean over channels: black 0, through red and yellow, white at ``largest``."""
+    level = np.clip(np.abs(truth - render).mean(axis=-1) / largest, 0.0, 1.0)
+    return np.stack([np.clip(3.0 * level - shift, 0.0, 1.0) for shift in (0.0, 1.0, 2.0)], axis=-1).astype(np.float32)
+
+
+def side_by_side(panels: list[Float], gap: int = 8) -> Float:
+    """Pictures of one height next to each other on white; grey ones become RGB."""
+    coloured = [np.repeat(p[..., None], 3, axis=-1) if p.ndim == 2 else p for p in panels]
+    white = np.ones((coloured[0].shape[0], gap, 3), np.float32)
+    pieces = [piece for panel in coloured for piece in (panel, white)]
+    return np.concatenate(pieces[:-1], axis=1)
