@@ -1,0 +1,150 @@
+// Python bindings. Shapes and ranges were checked by nerfvol/kernels/ops.py; types and layouts are checked here.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "pool.h"
+#include "tree.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+using namespace nerfvol;
+
+template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
+template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
+using Rows = In<float, nb::ndim<2>>;
+template <class T> using Maybe = std::optional<T>;
+
+namespace {
+
+template <class T> auto pointer(const Maybe<T>& array) -> decltype(array->data()) { return array ? array->data() : nullptr; }
+
+// Holds the arrays of an octree for as long as the views of them are used.
+struct TreeArrays {
+    In<uint8_t, nb::ndim<1>> node_mask, leaf_mask;
+    In<int32_t, nb::ndim<1>> first_node, first_leaf;
+    In<int32_t, nb::shape<-1, 8>> corners;
+    Rows values;
+    Tree tree;
+};
+
+void init_tree(TreeArrays* self, In<uint8_t, nb::ndim<1>> node_mask, In<uint8_t, nb::ndim<1>> leaf_mask,
+               In<int32_t, nb::ndim<1>> first_node, In<int32_t, nb::ndim<1>> first_leaf, In<int32_t, nb::shape<-1, 8>> corners,
+               Rows values, int sh_degree, std::vector<float> origin, float size, float density_scale) {
+    auto* t = new (self) TreeArrays{node_mask, leaf_mask, first_node, first_leaf, corners, values, {}};
+    Tree& v = t->tree;
+    v.node_mask = node_mask.data();
+    v.leaf_mask = leaf_mask.data();
+    v.first_node = first_node.data();
+    v.first_leaf = first_leaf.data();
+    v.corners = corners.data();
+    v.values = values.data();
+    v.n_nodes = int64_t(node_mask.shape(0));
+    v.n_leaves = int64_t(corners.shape(0));
+    v.n_vertices = int64_t(values.shape(0));
+    v.blocks = int(values.shape(1) / 16);
+    v.sh_degree = sh_degree;
+    for (int k = 0; k < 3; ++k) v.origin[k] = origin.at(size_t(k));
+    v.size = size;
+    v.density_scale = density_scale;
+}
+
+Rays make_rays(const Rows& origins, const Rows& directions) {
+    Rays r{origins.data(), directions.data(), int64_t(directions.shape(0)), false};
+    r.origin_per_tile = origins.shape(0) != directions.shape(0);
+    if (r.origin_per_tile && int64_t(origins.shape(0)) != (r.n + kTile - 1) / kTile)
+        throw std::invalid_argument("rays_o must have one row per ray or one per 64 rays");
+    return r;
+}
+
+RenderOptions make_options(const std::vector<float>& background, float eps) {
+    return {{background.at(0), background.at(1), background.at(2)}, eps};
+}
+
+using Floats = Out<float, nb::ndim<1>>;
+using FloatRows = Out<float, nb::ndim<2>>;
+
+void py_render(const TreeArrays& t, Rows origins, Rows directions, std::vector<float> background, float eps, Maybe<FloatRows> rgb,
+               Maybe<Floats> trans, Maybe<Floats> depth, Maybe<Floats> median, Maybe<FloatRows> normal) {
+    const Rays rays = make_rays(origins, directions);
+    const RenderOptions options = make_options(background, eps);
+    const RenderOutput out{pointer(rgb), pointer(trans), pointer(depth), pointer(median), pointer(normal)};
+    nb::gil_scoped_release release;
+    kernels().render(t.tree, rays, options, out);
+}
+
+void py_render_backward(const TreeArrays& t, Rows origins, Rows directions, std::vector<float> background, float eps,
+                        Maybe<Rows> rgb, Maybe<In<float, nb::ndim<1>>> trans, Maybe<In<float, nb::ndim<1>>> depth,
+                        FloatRows gradient, Out<int32_t, nb::ndim<1>> slots) {
+    const Rays rays = make_rays(origins, directions);
+    const RenderOptions options = make_options(background, eps);
+    const Cotangents cotangents{pointer(rgb), pointer(trans), pointer(depth)};
+    const GradientSink sink{gradient.data(), nullptr, slots.data()};
+    nb::gil_scoped_release release;
+    kernels().backward(t.tree, rays, options, &cotangents, nullptr, sink, {nullptr, nullptr, nullptr}, 1.0f);
+}
+
+// One training step. With `gradient` the dense gradient of the loss is added there and nothing else changes; without it the
+// optimiser updates values and moments.
+nb::tuple py_train_step(const TreeArrays& t, Rows origins, Rows directions, Rows target, In<float, nb::ndim<1>> weight,
+                        std::vector<float> background, float eps, float colour, float distortion, float pixel_angle,
+                        Maybe<FloatRows> gradient, Maybe<FloatRows> values, Maybe<FloatRows> moments, std::vector<float> rates,
+                        float beta, float opt_eps, Out<int32_t, nb::ndim<1>> slots, Maybe<Floats> max_weight, Maybe<Floats> error,
+                        Maybe<Floats> footprint) {
+    const Rays rays = make_rays(origins, directions);
+    const RenderOptions options = make_options(background, eps);
+    const Loss loss{target.data(), weight.data(), {background[0], background[1], background[2]}, colour, distortion};
+    const Optimizer optimizer{pointer(values), pointer(moments), rates.at(0), rates.at(1), rates.at(2), beta, opt_eps};
+    if (!gradient && (!values || !moments || values->data() != t.tree.values))
+        throw std::invalid_argument("the optimiser needs the octree's own values and their moments");
+    const GradientSink sink{pointer(gradient), gradient ? nullptr : &optimizer, slots.data()};
+    const LeafStatistics statistics{pointer(max_weight), pointer(error), pointer(footprint)};
+    StepReport r;
+    {
+        nb::gil_scoped_release release;
+        r = kernels().backward(t.tree, rays, options, nullptr, &loss, sink, statistics, pixel_angle);
+    }
+    return nb::make_tuple(r.squared_error, r.weight, r.samples);
+}
+
+int64_t py_number_vertices(In<int64_t, nb::ndim<1>> keys, Out<int32_t, nb::ndim<1>> ids, Out<int64_t, nb::ndim<1>> first) {
+    nb::gil_scoped_release release;
+    return number_vertices(keys.data(), int64_t(keys.shape(0)), ids.data(), first.data());
+}
+
+}  // namespace
+
+NB_MODULE(_nerfvol_kernels, m) {
+    m.attr("__version__") = NERFVOL_VERSION;
+    m.attr("TILE") = kTile;
+    m.attr("MAX_LEVEL") = kMaxLevel;
+    nb::class_<TreeArrays>(m, "Tree").def(
+        "__init__", &init_tree,
+        "node_mask"_a, "leaf_mask"_a, "first_node"_a, "first_leaf"_a, "corners"_a, "values"_a, "sh_degree"_a, "origin"_a, "size"_a,
+        "density_scale"_a);
+    m.def("render", &py_render, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(),
+          "trans"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none());
+    m.def("render_backward", &py_render_backward, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a,
+          "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "gradient"_a, "slots"_a);
+    m.def("train_step", &py_train_step, "tree"_a, "rays_o"_a, "rays_d"_a, "target"_a, "weight"_a, "background"_a,
+          "early_stop_eps"_a, "colour"_a, "distortion"_a, "pixel_angle"_a, "gradient"_a.none(), "values"_a.none(),
+          "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a, "max_weight"_a.none(), "error"_a.none(),
+          "footprint"_a.none());
+    m.def("number_vertices", &py_number_vertices, "keys"_a, "ids"_a, "first"_a);
+    m.def("set_threads", &set_threads, "n"_a);
+    m.def("get_threads", &get_threads);
+    m.def("isa", [] { return std::string(isa_name()); });
+    m.def("set_isa", [](const std::string& name) { return set_isa(name.c_str()); }, "name"_a);
+    m.def("available_isas", [] {
+        const char* names[3];
+        const int n = available_isas(names);
+        return std::vector<std::string>(names, names + n);
+    });
+}

@@ -1,0 +1,88 @@
+// Emission-absorption quadrature along the rays of one packet, and its adjoint, side by side.
+//
+// Forward:  alpha = 1 - exp(-tau), w = T alpha, C += w c, T *= exp(-tau).
+// Adjoint:  with q = dL/dw of a segment and S the sum of w q behind it (plus T_N q_N),
+//           dL/dtau = T_after q - S,  dL/dc = w dL/dC + ...   [Max 95; docs/mathematics.md]
+// A packet's segments are kept, in the order of the walk, for as long as the adjoint needs them: some 50 kB that stay in
+// the core's own cache, where a second traversal would cost more than it saves.
+#pragma once
+#include <vector>
+
+#include "shade.h"
+
+namespace NERFVOL_ISA {
+
+// One segment: a ray in a leaf. After the adjoint `value` holds the gradient in the same four places.
+struct Hit {
+    f4 value;                      // r, g, b (without 1/2), raw density
+    float fx, fy, fz;              // place in the leaf
+    float length;                  // scene units
+    float weight, trans_after, middle;
+    float tau_slope;               // d tau / d raw
+    int32_t lane;
+};
+
+struct Visit {                     // a leaf and its hits, consecutive in the packet's list
+    int32_t leaf, n_hits;
+    float max_weight, error, near;
+    float side;
+};
+
+struct PacketState {
+    alignas(64) float trans[kTile];
+    f4 colour[kTile];              // r, g, b, expected distance
+};
+
+inline void start(PacketState& s) {
+    for (int l = 0; l < kTile; ++l) { s.trans[l] = 1.0f; s.colour[l] = f4{}; }
+}
+
+// Optical depth, its slope in the raw density, exp(-tau) and alpha of up to 64 hits.
+struct Extinction {
+    alignas(64) float raw[kTile], length[kTile], slope[kTile], through[kTile], alpha[kTile];
+
+    void evaluate(int n, float density_scale, bool with_slope) {
+        for (int i = 0; i < n; i += 16) {
+            const f16 r = load<f16>(raw + i), scaled = load<f16>(length + i) * density_scale;
+            const f16 tau = scaled * explin(r), e = exp16(-tau);
+            store(through + i, e);
+            store(alpha + i, one_minus_exp(tau, e));
+            if (with_slope) store(slope + i, scaled * explin_slope(r));
+        }
+    }
+};
+
+// The segments of one ray packet, delivered leaf by leaf with a little look-ahead so that memory can arrive in time.
+template <int B, class Sink> void march(const Tree& tree, Packet& p, const BasisRows<B>& basis, Sink&& sink) {
+    constexpr int kAhead = 4;
+    Walk walk(tree, p);
+    Leaf queue[kAhead];
+    int head = 0, waiting = 0;
+    Segments segments;
+    bool more = true;
+    for (;;) {
+        while (more && waiting < kAhead) {
+            Leaf& leaf = queue[(head + waiting) % kAhead];
+            more = walk.next(leaf);
+            if (!more) break;
+            const int32_t* c = tree.corners + 8 * int64_t(leaf.index);
+            for (int o = 0; o < 8; ++o)
+                for (int k = 0; k < B; ++k) __builtin_prefetch(tree.values + 16 * (B * int64_t(c[o]) + k));
+            ++waiting;
+        }
+        if (!waiting) return;
+        Leaf& leaf = queue[head];
+        head = (head + 1) % kAhead;
+        --waiting;
+        leaf.rays &= p.alive;
+        if (!leaf.rays) continue;
+        const uint64_t hits = intersect(p, leaf, segments);
+        if (!hits) continue;
+        const int32_t* c = tree.corners + 8 * int64_t(leaf.index);
+        const float* rows[8];
+        for (int o = 0; o < 8; ++o) rows[o] = tree.values + 16 * B * int64_t(c[o]);
+        sink(leaf, hits, segments, rows, basis);
+    }
+}
+
+}  // namespace NERFVOL_ISA

@@ -1,0 +1,370 @@
+// Forward and adjoint over a batch of tiles, then the gradient's sum per vertex and the optimiser.
+//
+// Two phases, both parallel, neither with atomics. Phase 1 works tile by tile and leaves, for each hit, four numbers: the
+// gradient of the field at that point. Phase 2 works range of vertices by range of vertices ("bucket"): one thread adds up
+// all hits that touch its range in the order of the batch and applies the optimiser on the spot, while the sums lie in its
+// own cache. The order of every sum is fixed by the batch, so the result is the same to the last bit for any number of
+// threads.
+#pragma once
+#include <algorithm>
+#include <memory>
+#include <mutex>
+
+#include "render.h"
+
+namespace NERFVOL_ISA {
+
+using nerfvol::Cotangents;
+using nerfvol::GradientSink;
+using nerfvol::kBuckets;
+using nerfvol::LeafStatistics;
+using nerfvol::Loss;
+using nerfvol::Optimizer;
+using nerfvol::StepReport;
+
+// What phase 1 leaves of one packet. Kept between steps to spare the allocations.
+struct PacketRecord {
+    std::vector<Hit> hits;
+    std::vector<Visit> visits;
+    std::vector<int32_t> first_hit;       // of each visit
+    std::vector<int32_t> order;           // visits grouped by bucket (a visit that straddles stands in several groups)
+    int32_t offset[kBuckets + 1];
+    alignas(64) float basis[kTile][64];   // rows of BasisRows, 16 * B used
+    StepReport report;
+};
+
+inline int bucket_shift(int64_t n_vertices) {
+    int shift = 0;
+    while (((n_vertices - 1) >> shift) >= kBuckets) ++shift;
+    return shift;
+}
+
+template <int B>
+void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, PacketRecord& rec) {
+    Extinction x;
+    rec.hits.clear();
+    rec.visits.clear();
+    rec.first_hit.clear();
+    start(state);
+    march<B>(tree, p, basis, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const float* const* rows, const BasisRows<B>& b) {
+        const int m = __builtin_popcountll(hits);
+        const size_t base = rec.hits.size();
+        rec.hits.resize(base + size_t(m));
+        Hit* h = rec.hits.data() + base;
+        int i = 0;
+        for (uint64_t rest = hits; rest; rest &= rest - 1, ++i) {
+            const int l = __builtin_ctzll(rest);
+            h[i].lane = l;
+            h[i].fx = s.fx[l]; h[i].fy = s.fy[l]; h[i].fz = s.fz[l];
+            h[i].length = s.length[l] * tree.size;
+            h[i].middle = s.middle[l];
+            h[i].value = evaluate<B>(rows, trilinear(s.fx[l], s.fy[l], s.fz[l]), b.row[l]);
+            x.raw[i] = h[i].value[3];
+            x.length[i] = h[i].length;
+        }
+        x.evaluate(m, tree.density_scale, true);
+        Visit visit = {leaf.index, m, 0, 0, 1e30f, leaf.side};
+        for (i = 0; i < m; ++i) {
+            const int l = h[i].lane;
+            const float before = state.trans[l], w = before * x.alpha[i];
+            h[i].weight = w;
+            h[i].trans_after = state.trans[l] = before * x.through[i];
+            h[i].tau_slope = x.slope[i];
+            f4 c = h[i].value + 0.5f;
+            c[3] = h[i].middle;
+            state.colour[l] += w * c;
+            visit.max_weight = std::max(visit.max_weight, w);
+            visit.near = std::min(visit.near, h[i].middle);
+            if (h[i].trans_after < eps) p.alive &= ~(1ull << l);
+        }
+        rec.visits.push_back(visit);
+        rec.first_hit.push_back(int32_t(base));
+    });
+}
+
+// Per ray, what the adjoint needs beside the hits.
+struct Adjoint {
+    f4 colour[kTile];                      // dL/dC, and dL/d(expected distance in root cubes)
+    float behind[kTile];                   // S: starts at T_N q_N
+    float target[kTile][3], colour_weight[kTile], distortion_weight[kTile], error[kTile];
+    float weight_sum[kTile], moment_sum[kTile];          // over all hits, for the distortion loss
+    float weight_behind[kTile], moment_behind[kTile];
+};
+
+inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState& s,
+                                  int64_t first, int n, Adjoint& a) {
+    for (int l = 0; l < n; ++l) {
+        const int64_t i = first + l;
+        float q = c.trans ? c.trans[i] : 0.0f;
+        f4 g{};
+        if (c.rgb)
+            for (int k = 0; k < 3; ++k) { g[k] = c.rgb[3 * i + k]; q += g[k] * options.background[k]; }
+        if (c.depth) g[3] = c.depth[i] * tree.size;
+        a.colour[l] = g;
+        a.behind[l] = s.trans[l] * q;
+        a.colour_weight[l] = a.distortion_weight[l] = a.error[l] = 0;
+        a.weight_sum[l] = a.moment_sum[l] = 0;
+    }
+}
+
+inline void adjoint_of_loss(const Loss& loss, const PacketState& s, int64_t first, int n, Adjoint& a, StepReport& report) {
+    for (int l = 0; l < n; ++l) {
+        const float* target = loss.target + 3 * (first + l);
+        const float weight = loss.weight[first + l];
+        float q = 0, error = 0, miss = 0;
+        f4 g{};
+        for (int k = 0; k < 3; ++k) {
+            const float residual = s.colour[l][k] + s.trans[l] * loss.background[k] - target[k];
+            const float d = loss.background[k] - target[k];
+            a.target[l][k] = target[k];
+            error += residual * residual;
+            miss += d * d;
+            g[k] = 2 * weight * residual;
+            q += g[k] * loss.background[k];
+        }
+        a.colour[l] = g;
+        a.behind[l] = s.trans[l] * (q + weight * loss.colour * miss);
+        a.colour_weight[l] = weight * loss.colour;
+        a.distortion_weight[l] = weight * loss.distortion;
+        a.error[l] = weight * error;
+        a.weight_sum[l] = 1 - s.trans[l];
+        a.moment_sum[l] = s.colour[l][3];
+        report.squared_error += double(weight) * error;
+        report.weight += weight;
+    }
+}
+
+// Back to front: replaces each hit's value by dL/d(r, g, b, raw density).
+inline void backward_packet(PacketRecord& rec, Adjoint& a, float per_length) {
+    for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
+    for (size_t v = rec.visits.size(); v-- > 0;) {
+        Visit& visit = rec.visits[v];
+        Hit* h = rec.hits.data() + rec.first_hit[v];
+        for (int i = 0; i < visit.n_hits; ++i) {
+            const int l = h[i].lane;
+            const float w = h[i].weight;
+            f4 c = h[i].value + 0.5f;
+            c[3] = h[i].middle;
+            const f4 product = a.colour[l] * c;
+            float q = product[0] + product[1] + product[2] + product[3];
+            f4 gradient = w * a.colour[l];
+            if (a.colour_weight[l] > 0) {
+                f4 away = {c[0] - a.target[l][0], c[1] - a.target[l][1], c[2] - a.target[l][2], 0};
+                const f4 square = away * away;
+                q += a.colour_weight[l] * (square[0] + square[1] + square[2]);
+                gradient += 2 * a.colour_weight[l] * w * away;
+            }
+            if (a.distortion_weight[l] > 0) {
+                const float m = h[i].middle;
+                const float w_behind = a.weight_behind[l], m_behind = a.moment_behind[l];
+                const float w_front = a.weight_sum[l] - w_behind - w, m_front = a.moment_sum[l] - m_behind - w * m;
+                q += a.distortion_weight[l] * (2 * (m * (w_front - w_behind) - (m_front - m_behind)) +
+                                               (2.0f / 3.0f) * w * h[i].length * per_length);
+                a.weight_behind[l] = w_behind + w;
+                a.moment_behind[l] = m_behind + w * m;
+            }
+            gradient[3] = (h[i].trans_after * q - a.behind[l]) * h[i].tau_slope;
+            a.behind[l] += w * q;
+            h[i].value = gradient;
+            visit.error += w * a.error[l];
+        }
+    }
+}
+
+inline void group_by_bucket(const Tree& tree, int shift, PacketRecord& rec) {
+    std::memset(rec.offset, 0, sizeof(rec.offset));
+    const int n = int(rec.visits.size());
+    auto buckets = [&](int v, int32_t* out) {  // distinct buckets of a visit's corners
+        const int32_t* c = tree.corners + 8 * int64_t(rec.visits[size_t(v)].leaf);
+        int m = 0;
+        for (int o = 0; o < 8; ++o) {
+            const int32_t b = c[o] >> shift;
+            bool known = false;
+            for (int j = 0; j < m; ++j) known |= out[j] == b;
+            if (!known) out[m++] = b;
+        }
+        return m;
+    };
+    int32_t b[8];
+    for (int v = 0; v < n; ++v)
+        for (int j = buckets(v, b); j-- > 0;) ++rec.offset[b[j] + 1];
+    for (int k = 0; k < kBuckets; ++k) rec.offset[k + 1] += rec.offset[k];
+    rec.order.resize(size_t(rec.offset[kBuckets]));
+    int32_t at[kBuckets];
+    std::memcpy(at, rec.offset, sizeof(at));
+    for (int v = 0; v < n; ++v) {
+        const int m = buckets(v, b);
+        for (int j = 0; j < m; ++j) rec.order[size_t(at[b[j]]++)] = v;
+    }
+}
+
+// Gradient sums of the vertices in one bucket.
+template <int B> struct Sums {
+    std::vector<float> rows;
+    std::vector<int32_t> touched;
+
+    float* row(int32_t vertex, int32_t* slots) {
+        int32_t& slot = slots[vertex];
+        if (slot < 0) {
+            slot = int32_t(touched.size());
+            touched.push_back(vertex);
+            rows.resize(rows.size() + 16 * B, 0.0f);
+        }
+        return rows.data() + size_t(slot) * 16 * B;
+    }
+};
+
+template <int B> void add_visit(const Tree& tree, const PacketRecord& rec, int v, int bucket, int shift, int32_t* slots, Sums<B>& sums) {
+    const Visit& visit = rec.visits[size_t(v)];
+    const Hit* h = rec.hits.data() + rec.first_hit[size_t(v)];
+    f16 corner[8][B];
+    for (int o = 0; o < 8; ++o)
+        for (int k = 0; k < B; ++k) corner[o][k] = f16{};
+    for (int i = 0; i < visit.n_hits; ++i) {
+        alignas(32) float w[8];
+        store(w, trilinear(h[i].fx, h[i].fy, h[i].fz));
+        const f4 v4 = h[i].value;
+        const f16 g = __builtin_shufflevector(v4, v4, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+        const float* basis = rec.basis[h[i].lane];
+        for (int k = 0; k < B; ++k) {
+            f16 b = load<f16>(basis + 16 * k);
+            f16 gk = g;
+            if (B == 2 && k == 1) gk = __builtin_shufflevector(v4, v4, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 3);
+            gk *= b;
+            for (int o = 0; o < 8; ++o) corner[o][k] += w[o] * gk;
+        }
+    }
+    const int32_t* c = tree.corners + 8 * int64_t(visit.leaf);
+    for (int o = 0; o < 8; ++o) {
+        if (c[o] >> shift != bucket) continue;
+        float* row = sums.row(c[o], slots);
+        for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(row + 16 * k) + corner[o][k]);
+    }
+}
+
+template <int B> void apply(const GradientSink& sink, Sums<B>& sums) {
+    const int n = int(sums.touched.size());
+    const float dc = sink.optimizer ? sink.optimizer->rate_dc : 0, sh = sink.optimizer ? sink.optimizer->rate_sh : 0;
+    const float density = sink.optimizer ? sink.optimizer->rate_density : 0;
+    f16 rate[B];
+    for (int k = 0; k < B; ++k) rate[k] = splat16(sh);
+    rate[0] = f16{dc, sh, sh, sh, dc, sh, sh, sh, dc, sh, sh, sh, density, 0, 0, 0};
+    for (int i = 0; i < n; ++i) {
+        const int32_t vertex = sums.touched[size_t(i)];
+        const int64_t at = 16 * B * int64_t(vertex);
+        if (sink.optimizer && i + 4 < n) {
+            const int64_t ahead = 16 * B * int64_t(sums.touched[size_t(i) + 4]);
+            for (int k = 0; k < B; ++k) {
+                __builtin_prefetch(sink.optimizer->moments + ahead + 16 * k, 1);
+                __builtin_prefetch(sink.optimizer->values + ahead + 16 * k, 1);
+            }
+        }
+        for (int k = 0; k < B; ++k) {
+            const f16 g = load<f16>(sums.rows.data() + 16 * (size_t(i) * B + size_t(k)));
+            if (sink.gradient) {
+                store(sink.gradient + at + 16 * k, load<f16>(sink.gradient + at + 16 * k) + g);
+                continue;
+            }
+            const Optimizer& opt = *sink.optimizer;
+            float* moment = opt.moments + at + 16 * k;
+            float* value = opt.values + at + 16 * k;
+            const f16 old = load<f16>(moment), g2 = g * g;
+            const f16 m = old > 0.0f ? old * opt.beta + g2 * (1 - opt.beta) : g2;
+            alignas(64) float root[16];
+            store(root, m);
+            for (int j = 0; j < 16; ++j) root[j] = std::sqrt(root[j]) + opt.eps;
+            store(moment, m);
+            store(value, load<f16>(value) - rate[k] * g / load<f16>(root));
+        }
+        sink.slots[vertex] = -1;
+    }
+    sums.touched.clear();
+    sums.rows.clear();
+}
+
+inline void add_statistics(const PacketRecord& rec, const Visit& visit, const LeafStatistics& out, float pixel_angle) {
+    (void)rec;
+    float& w = out.max_weight[visit.leaf];
+    w = std::max(w, visit.max_weight);
+    out.error[visit.leaf] += visit.error;
+    float& f = out.footprint[visit.leaf];
+    f = std::max(f, visit.side / (std::max(visit.near, 1e-6f) * pixel_angle));
+}
+
+template <int B>
+StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions& options, const Cotangents* cotangents,
+                         const Loss* loss, const GradientSink& sink, const LeafStatistics& statistics, float pixel_angle) {
+    // Packets: runs of at most 64 rays from one origin.
+    std::vector<std::pair<int64_t, int>> packets;
+    for (int64_t i = 0; i < rays.n;) {
+        const int64_t tile_end = std::min<int64_t>((i / kTile + 1) * kTile, rays.n);
+        int64_t j = i + 1;
+        if (rays.origin_per_tile) j = tile_end;
+        else
+            while (j < tile_end && !std::memcmp(rays.origins + 3 * j, rays.origins + 3 * i, 12)) ++j;
+        packets.emplace_back(i, int(j - i));
+        i = j;
+    }
+    static std::mutex one_call;
+    const std::lock_guard<std::mutex> lock(one_call);
+    static std::vector<std::unique_ptr<PacketRecord>> records;
+    while (records.size() < packets.size()) records.emplace_back(new PacketRecord);
+    const int n = int(packets.size()), shift = bucket_shift(tree.n_vertices);
+
+    nerfvol::parallel_for(n, [&](int i, int) {
+        PacketRecord& rec = *records[size_t(i)];
+        const int64_t first = packets[size_t(i)].first;
+        const int count = packets[size_t(i)].second;
+        Packet p;
+        load_packet(tree, rays, first, first + count, p);
+        if (loss)
+            for (int l = 0; l < count; ++l)
+                if (!(loss->weight[first + l] > 0)) p.alive &= ~(1ull << l);
+        if (loss) bound_packet(p);
+        BasisRows<B> basis;
+        basis.fill(p, tree.sh_degree);
+        for (int l = 0; l < count; ++l) std::memcpy(rec.basis[l], basis.row[l], sizeof(basis.row[l]));
+        PacketState state;
+        forward_packet<B>(tree, p, basis, options.early_stop_eps, state, rec);
+        Adjoint adjoint;
+        rec.report = {0, 0, double(rec.hits.size())};
+        if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
+        else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
+        backward_packet(rec, adjoint, 1.0f / tree.size);
+        group_by_bucket(tree, shift, rec);
+    });
+
+    nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
+        static thread_local Sums<B> sums;
+        for (int i = 0; i < n; ++i) {
+            const PacketRecord& rec = *records[size_t(i)];
+            for (int32_t k = rec.offset[bucket]; k < rec.offset[bucket + 1]; ++k) {
+                const int v = rec.order[size_t(k)];
+                const Visit& visit = rec.visits[size_t(v)];
+                add_visit<B>(tree, rec, v, bucket, shift, sink.slots, sums);
+                if (statistics.max_weight && tree.corners[8 * int64_t(visit.leaf)] >> shift == bucket)
+                    add_statistics(rec, visit, statistics, pixel_angle);
+            }
+        }
+        apply<B>(sink, sums);
+    });
+
+    StepReport total{0, 0, 0};
+    for (int i = 0; i < n; ++i) {
+        total.squared_error += records[size_t(i)]->report.squared_error;
+        total.weight += records[size_t(i)]->report.weight;
+        total.samples += records[size_t(i)]->report.samples;
+    }
+    return total;
+}
+
+inline StepReport backward(const Tree& tree, const Rays& rays, const RenderOptions& options, const Cotangents* cotangents,
+                           const Loss* loss, const GradientSink& sink, const LeafStatistics& statistics, float pixel_angle) {
+    switch (tree.blocks) {
+        case 1: return backward_rays<1>(tree, rays, options, cotangents, loss, sink, statistics, pixel_angle);
+        case 2: return backward_rays<2>(tree, rays, options, cotangents, loss, sink, statistics, pixel_angle);
+        default: return backward_rays<4>(tree, rays, options, cotangents, loss, sink, statistics, pixel_angle);
+    }
+}
+
+}  // namespace NERFVOL_ISA

@@ -1,0 +1,87 @@
+// Views of the arrays that Python owns, and the parameters of each operator. Plain data, shared by all instruction sets.
+#pragma once
+#include <cstdint>
+
+namespace nerfvol {
+
+constexpr int kTile = 64;         // rays in a packet: an 8x8 tile of one image
+constexpr int kMaxLevel = 16;
+constexpr int kBuckets = 128;     // ranges of vertices; each is updated by one thread in a fixed order
+
+// The octree in the unit cube: see nerfvol/octree.py for the meaning of each array.
+struct Tree {
+    const uint8_t *node_mask, *leaf_mask;        // (n_nodes)
+    const int32_t *first_node, *first_leaf;      // (n_nodes) exclusive prefix sums of the masks' population counts
+    const int32_t* corners;                      // (n_leaves, 8) vertex of each corner
+    const float* values;                         // (n_vertices, 16 * blocks) packed SH and raw density
+    int64_t n_nodes, n_leaves, n_vertices;
+    int blocks;                                  // 16-float blocks in a vertex row: 1 (degree 0-1), 2 (degree 2), 4 (degree 3)
+    int sh_degree;
+    float origin[3], size;                       // root cube, scene units
+    float density_scale;                         // 1 / scene unit
+};
+
+struct Rays {
+    const float *origins, *directions;           // (n, 3) scene units; unit length
+    int64_t n;
+    bool origin_per_tile;                        // origins has one row per 64 rays
+};
+
+struct RenderOptions {
+    float background[3];
+    float early_stop_eps;                        // a ray ends when its transmittance falls below; 0 = exact
+};
+
+// Outputs, each (n) or (n, 3); null = not wanted.
+struct RenderOutput {
+    float *rgb, *trans, *depth, *median_depth, *normal;
+};
+
+// What the adjoint starts from: cotangents of the outputs, or a loss on target colours.
+struct Cotangents {
+    const float *rgb, *trans, *depth;            // (n,3), (n), (n)
+};
+struct Loss {
+    const float* target;                         // (n, 3)
+    const float* weight;                         // (n) weight of each ray; 0 = padding
+    float background[3];
+    float colour;                                // weight of sum_i w_i |c_i - target|^2 + T |background - target|^2
+    float distortion;                            // weight of the distortion loss of Mip-NeRF 360 (distances in root cubes)
+};
+
+// RMSprop, applied only to vertices that this batch touched.
+struct Optimizer {
+    float* values;                               // (n_vertices, 16 * blocks)
+    float* moments;                              // second moments, same shape; 0 = never touched
+    float rate_density, rate_dc, rate_sh;
+    float beta, eps;
+};
+
+struct LeafStatistics {                          // (n_leaves), updated in place; null = not wanted
+    float *max_weight, *error, *footprint;
+};
+
+struct StepReport {
+    double squared_error, weight, samples;       // summed over rays: weighted squared error, weights, hits
+};
+
+struct GradientSink {
+    float* gradient;                             // (n_vertices, 16 * blocks): dense sum, or null when the optimiser runs
+    const Optimizer* optimizer;
+    int32_t* slots;                              // (n_vertices) scratch, all -1 between calls
+};
+
+struct Kernels {
+    void (*render)(const Tree&, const Rays&, const RenderOptions&, const RenderOutput&);
+    StepReport (*backward)(const Tree&, const Rays&, const RenderOptions&, const Cotangents*, const Loss*,
+                           const GradientSink&, const LeafStatistics&, float pixel_angle);
+};
+
+const Kernels& kernels();                        // the chosen instruction set
+const char* isa_name();
+bool set_isa(const char* name);                  // "auto" or a name from available_isas(); false if this CPU lacks it
+int available_isas(const char** names);          // fills up to 3 names, best first
+
+int64_t number_vertices(const int64_t* keys, int64_t n, int32_t* ids, int64_t* first);
+
+}  // namespace nerfvol

@@ -1,0 +1,364 @@
+"""The operators on octrees: argument checks, autograd, and the choice between compiled kernels and torch reference.
+
+Rays: ``rays_d`` (n, 3) unit directions; ``rays_o`` (n, 3), or (ceil(n / 64), 3) where each run of 64 rays shares its
+origin. The kernels are fast when such a run is an 8x8 tile of one image (cameras.tile_pixels).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfvol.kernels import reference
+from nerfvol.native import native
+from nerfvol.octree import Octree
+
+TILE = 64
+WHITE = (1.0, 1.0, 1.0)
+DEFAULT_EARLY_STOP = 1 / 255
+
+
+# ------------------------------------------------------------------ which code runs
+def set_threads(n: int) -> None:
+    """Threads of the kernels and of torch."""
+    if n < 1:
+        raise ValueError(f"threads must be at least 1, got {n}")
+    torch.set_num_threads(n)
+    if (compiled := native()) is not None:
+        compiled.set_threads(n)
+
+
+def get_threads() -> int:
+    compiled = native()
+    return compiled.get_threads() if compiled is not None else torch.get_num_threads()
+
+
+def available_isas() -> list[str]:
+    """Builds of the kernels that this CPU can run, best first; ["reference"] without compiled kernels."""
+    compiled = native()
+    return compiled.available_isas() if compiled is not None else ["reference"]
+
+
+def isa() -> str:
+    """The build in use."""
+    compiled = native()
+    return compiled.isa() if compiled is not None else "reference"
+
+
+def set_isa(name: str) -> None:
+    """Chooses a build: "auto" or one of :func:`available_isas`."""
+    compiled = native()
+    if compiled is None or not compiled.set_isa(name):
+        raise ValueError(f"instruction set {name!r} is not available here, choose from {available_isas()}")
+
+
+if native() is not None and "NERFVOL_ISA" in os.environ:
+    set_isa(os.environ["NERFVOL_ISA"])
+
+
+def _tree(octree: Octree, values: np.ndarray):
+    compiled = native()
+    assert compiled is not None
+    return compiled.Tree(
+        octree.node_mask,
+        octree.leaf_mask,
+        octree.first_node,
+        octree.first_leaf,
+        octree.corners,
+        values,
+        octree.sh_degree,
+        [float(x) for x in octree.origin],
+        octree.size,
+        octree.density_scale,
+    )
+
+
+def _check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
+    o, d = (np.ascontiguousarray(a, dtype=np.float32) for a in (rays_o, rays_d))
+    if d.ndim != 2 or d.shape[1] != 3:
+        raise ValueError(f"rays_d must have shape (n, 3), got {d.shape}")
+    if o.ndim != 2 or o.shape[1] != 3 or len(o) not in (len(d), -(-len(d) // TILE)):
+        raise ValueError(f"rays_o must have one row per ray or one per {TILE} rays of {len(d)}, got shape {o.shape}")
+    return o, d
+
+
+def _check_background(background) -> list[float]:
+    values = [float(x) for x in background]
+    if len(values) != 3 or not np.isfinite(values).all():
+        raise ValueError(f"background must be three finite numbers, got {background}")
+    return values
+
+
+def _per_ray(rays_o, n: int) -> Tensor:
+    o = torch.as_tensor(np.asarray(rays_o))
+    return o if len(o) == n else o.repeat_interleave(TILE, 0)[:n]
+
+
+# ------------------------------------------------------------------ rendering
+OUTPUTS = ("rgb", "opacity", "depth", "median_depth", "normal")
+
+
+def render_rays(
+    octree: Octree,
+    rays_o,
+    rays_d,
+    background: Sequence[float] = WHITE,
+    early_stop_eps: float = DEFAULT_EARLY_STOP,
+    outputs: Sequence[str] = OUTPUTS,
+) -> dict[str, Tensor]:
+    """Renders rays.
+
+    Returns float32 tensors for the names in ``outputs``: rgb (n, 3) over ``background``, opacity 1 - T (n,), depth
+    sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
+    weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
+    by less than that; 0 is exact.
+    """
+    o, d = _check_rays(rays_o, rays_d)
+    bg = _check_background(background)
+    unknown = set(outputs) - set(OUTPUTS)
+    if unknown:
+        raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
+    n = len(d)
+    if (compiled := native()) is None:
+        return _render_reference(octree, o, d, bg, early_stop_eps, outputs)
+    out = {k: np.empty((n, 3) if k in ("rgb", "normal") else n, np.float32) for k in OUTPUTS if k in outputs}
+    values = np.ascontiguousarray(octree.values, dtype=np.float32)
+    compiled.render(
+        _tree(octree, values),
+        o,
+        d,
+        bg,
+        float(early_stop_eps),
+        out.get("rgb"),
+        out.get("opacity"),
+        out.get("depth"),
+        out.get("median_depth"),
+        out.get("normal"),
+    )
+    if "opacity" in out:
+        np.subtract(1, out["opacity"], out=out["opacity"])
+    return {k: torch.from_numpy(v) for k, v in out.items()}
+
+
+def _render_reference(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -> dict[str, Tensor]:
+    parts = []
+    values = torch.from_numpy(octree.values)
+    origins, directions = _per_ray(o, len(d)), torch.from_numpy(d)
+    with torch.no_grad():
+        for ro, rd in zip(origins.split(chunk), directions.split(chunk), strict=True):
+            rgb, trans, depth = reference.render(octree, values, ro, rd, torch.tensor(bg), eps)
+            part = {"rgb": rgb, "opacity": 1 - trans, "depth": depth}
+            if "median_depth" in outputs:
+                part["median_depth"] = reference.median_depth(octree, reference.sample(octree, values, ro, rd, eps), len(rd))
+            if "normal" in outputs:
+                part["normal"] = reference.normals(octree, values, ro, rd, eps)
+            parts.append(part)
+    return {k: torch.cat([p[k] for p in parts]) for k in OUTPUTS if k in outputs}
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, values, octree, o, d, bg, eps):
+        compiled = native()
+        n = len(d)
+        rgb, trans, depth = (np.empty(shape, np.float32) for shape in ((n, 3), n, n))
+        compiled.render(_tree(octree, values.detach().numpy()), o, d, bg, eps, rgb, trans, depth, None, None)
+        ctx.saved = (values.detach(), octree, o, d, bg, eps)
+        return torch.from_numpy(rgb), torch.from_numpy(trans), torch.from_numpy(depth)
+
+    @staticmethod
+    def backward(ctx, d_rgb, d_trans, d_depth):
+        values, octree, o, d, bg, eps = ctx.saved
+        gradient = torch.zeros_like(values)
+        slots = np.full(octree.n_vertices, -1, np.int32)
+        cotangents = (g.contiguous().numpy() for g in (d_rgb, d_trans, d_depth))
+        native().render_backward(
+            _tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots
+        )
+        return gradient, None, None, None, None, None
+
+
+def render_values(
+    octree: Octree,
+    values: Tensor,
+    rays_o,
+    rays_d,
+    background: Sequence[float] = WHITE,
+    early_stop_eps: float = 0.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Differentiable rendering with vertex rows ``values`` (n_vertices, row) in place of the octree's own.
+
+    Returns rgb (n, 3), transmittance (n,), expected distance (n,); gradients flow to ``values``. float64 values run on
+    the reference, float32 on the compiled kernels where they exist.
+    """
+    if values.shape != octree.values.shape:
+        raise ValueError(f"values must have the octree's shape {octree.values.shape}, got {tuple(values.shape)}")
+    bg = _check_background(background)
+    if values.dtype == torch.float32 and native() is not None:
+        o, d = _check_rays(rays_o, rays_d)
+        return _Render.apply(values.contiguous(), octree, o, d, bg, float(early_stop_eps))
+    directions = torch.as_tensor(np.asarray(rays_d)).to(values.dtype)
+    origins = _per_ray(rays_o, len(directions)).to(values.dtype)
+    return reference.render(octree, values, origins, directions, torch.tensor(bg, dtype=values.dtype), early_stop_eps)
+
+
+# ------------------------------------------------------------------ training
+@dataclass(frozen=True)
+class Batch:
+    """Tiles of training rays. rays_o (n_tiles, 3); rays_d, target (64 n_tiles, 3); weight (64 n_tiles,), 0 = padding."""
+
+    rays_o: np.ndarray
+    rays_d: np.ndarray
+    target: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """See reference.loss for the formula."""
+
+    background: Sequence[float] = WHITE
+    colour: float = 0.0
+    distortion: float = 0.0
+    early_stop_eps: float = DEFAULT_EARLY_STOP
+
+
+@dataclass(frozen=True)
+class Rates:
+    """RMSprop: value -= rate * g / (sqrt(m) + eps), m the running mean of g^2 (started with the first g^2)."""
+
+    density: float
+    dc: float
+    sh: float
+    beta: float = 0.98
+    eps: float = 1e-8
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """squared_error: weighted mean over rays and channels; samples: segments per ray."""
+
+    squared_error: float
+    samples: float
+
+
+class TrainState:
+    """What training keeps beside the octree: second moments (n_vertices, row) and statistics of the leaves (n_leaves,).
+
+    max_weight: largest rendering weight; error: sum of weight x squared error; footprint: largest size in pixels; all
+    since :meth:`reset_statistics`.
+    """
+
+    def __init__(self, octree: Octree, moments: np.ndarray | None = None):
+        self.moments = np.zeros_like(octree.values) if moments is None else np.ascontiguousarray(moments)
+        self.slots = np.full(octree.n_vertices, -1, np.int32)
+        self.reset_statistics(octree.n_leaves)
+
+    def reset_statistics(self, n_leaves: int) -> None:
+        self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
+
+
+def train_step(
+    octree: Octree, state: TrainState, batch: Batch, options: LossOptions, rates: Rates, pixel_angle: float
+) -> StepReport:
+    """One optimiser step on ``octree.values`` in place. pixel_angle: angle between neighbouring rays, radians.
+
+    Bitwise the same for any number of threads.
+    """
+    o, d = _check_rays(batch.rays_o, batch.rays_d)
+    bg = _check_background(options.background)
+    if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
+        raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")
+    if (compiled := native()) is None:
+        return _train_step_reference(octree, state, batch, options, rates, pixel_angle)
+    squared, weight, samples = compiled.train_step(
+        _tree(octree, octree.values),
+        o,
+        d,
+        batch.target,
+        batch.weight,
+        bg,
+        float(options.early_stop_eps),
+        float(options.colour),
+        float(options.distortion),
+        float(pixel_angle),
+        None,
+        octree.values,
+        state.moments,
+        [rates.density, rates.dc, rates.sh],
+        rates.beta,
+        rates.eps,
+        state.slots,
+        state.max_weight,
+        state.error,
+        state.footprint,
+    )
+    return StepReport(squared / max(3 * weight, 1e-30), samples / max(len(d), 1))
+
+
+def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOptions) -> Tensor:
+    """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled."""
+    if values.dtype == torch.float32 and (compiled := native()) is not None:
+        o, d = _check_rays(batch.rays_o, batch.rays_d)
+        gradient = torch.zeros_like(values)
+        slots = np.full(octree.n_vertices, -1, np.int32)
+        tree = _tree(octree, values.detach().contiguous().numpy())
+        compiled.train_step(
+            tree, o, d, batch.target, batch.weight, _check_background(options.background), float(options.early_stop_eps),
+            float(options.colour), float(options.distortion), 1.0, gradient.numpy(), None, None, [0.0, 0.0, 0.0], 0.0, 0.0,
+            slots, None, None, None,
+        )  # fmt: skip
+        return gradient
+    leaf = values.detach().clone().requires_grad_()
+    total, _ = _reference_loss(octree, leaf, batch, options)
+    return torch.autograd.grad(total, leaf)[0]
+
+
+def _reference_loss(octree: Octree, values: Tensor, batch: Batch, options: LossOptions):
+    live = torch.from_numpy(batch.weight > 0)
+    to = lambda a: torch.as_tensor(np.asarray(a)).to(values.dtype)  # noqa: E731
+    origins, directions = _per_ray(batch.rays_o, len(batch.rays_d)), to(batch.rays_d)
+    total, report = reference.loss(
+        octree, values, to(origins)[live], directions[live], to(batch.target)[live], to(batch.weight)[live], options
+    )
+    report["live"] = live
+    return total, report
+
+
+def _train_step_reference(octree: Octree, state: TrainState, batch: Batch, options, rates: Rates, pixel_angle: float):
+    values = torch.from_numpy(octree.values)
+    leaf = values.clone().requires_grad_()
+    total, report = _reference_loss(octree, leaf, batch, options)
+    gradient = torch.autograd.grad(total, leaf)[0]
+    samples: reference.Samples = report["samples"]
+    seg = samples.segments
+    with torch.no_grad():
+        touched = torch.from_numpy(octree.corners).long()[seg.leaf].flatten().unique()
+        g, moments = gradient[touched], torch.from_numpy(state.moments)
+        old = moments[touched]
+        new = torch.where(old > 0, rates.beta * old + (1 - rates.beta) * g * g, g * g)
+        moments[touched] = new
+        values[touched] -= _rate_row(octree, rates) * g / (new.sqrt() + rates.eps)
+
+        weight = torch.from_numpy(batch.weight)[report["live"]]
+        max_weight, footprint = torch.from_numpy(state.max_weight), torch.from_numpy(state.footprint)
+        max_weight.scatter_reduce_(0, seg.leaf, samples.weights.detach(), "amax")
+        error = samples.weights.detach() * (weight * report["squared_error"])[seg.ray]
+        torch.from_numpy(state.error).index_add_(0, seg.leaf, error)
+        side = torch.from_numpy(octree.leaf_sizes()).float()[seg.leaf]
+        footprint.scatter_reduce_(0, seg.leaf, side / (samples.middle.clamp_min(1e-6) * pixel_angle), "amax")
+    squared = float((weight * report["squared_error"]).sum())
+    return StepReport(squared / max(3 * float(weight.sum()), 1e-30), len(seg.ray) / max(len(batch.rays_d), 1))
+
+
+def _rate_row(octree: Octree, rates: Rates) -> Tensor:
+    row = torch.full((octree.values.shape[1],), float(rates.sh))
+    row[[0, 4, 8]] = rates.dc
+    row[12] = rates.density
+    row[13:16] = 0
+    return row
