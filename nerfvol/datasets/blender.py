@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfvol.cameras import Camera, rigid_pose
+from nerfvol.cameras import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.frames import Calibration, Frame, ImageFinder, Listing, hold_out
 from nerfvol.errors import InputError
@@ -52,25 +52,6 @@ def read_transforms(path: Path, split: str) -> Listing:
     frames, hint = _read_file(files[split])
     training, hint = _read_file(files["train"]) if "train" in files and split != "train" else (frames, hint)
     return Listing(frames, training, files[split], hint, messages)
-
-
-def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[Camera]:
-    """The cameras of a transforms*.json alone, for a path to render: images are not looked for.
-
-    ``size`` (width, height) is needed where the file states no w and h; where it does, it asks for another size.
-    """
-    cameras = []
-    for frame in _read_file(path)[0]:
-        stated = (frame.calibration.width, frame.calibration.height)
-        known = stated if None not in stated else size
-        if known is None:
-            raise InputError(f"{path}: the image size is missing: expected w and h in the file, or a size to render at")
-        try:
-            camera = Camera(frame.calibration.intrinsics(*known), frame.c2w)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
-        cameras.append(camera if size is None else camera.resized(*size))
-    return cameras
 
 
 def _read_single(path: Path, split: str) -> Listing:
