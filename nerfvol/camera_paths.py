@@ -6,6 +6,7 @@ list of camera-to-world matrices, so a data set's own file can be given as a pat
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -14,34 +15,53 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras import Camera, Intrinsics, orbit
+from nerfvol.datasets.frames import Calibration
 from nerfvol.errors import InputError
 from nerfvol.files import read_json
 
 DEFAULT_SIZE = (800, 800)
-_DEFAULT_ANGLE_X = 0.6911
+DEFAULT_ANGLE_X = 0.6911
 """Horizontal field of view, radians (40 degrees), where a file states none: that of the NeRF-synthetic scenes."""
+LARGEST_SIDE = 16384
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> list[Camera]:
-    """The cameras of a JSON path, resized to ``size`` (width, height) where given.
+    """The cameras of a JSON path, resized to ``size`` (width, height) where given; 800x800 where nobody states one.
 
     Raises:
         InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
     """
+    # The dialects' one reader of intrinsics; its own read_cameras insists on images and focal lengths.
+    from nerfvol.datasets.blender import _calibration, _matrix
+
     document = read_json(path)
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: expected a camera path, an object with a non-empty list 'frames'")
+    shared = {key: value for key, value in document.items() if key != "frames"}
     cameras = []
-    for index, frame in enumerate(document["frames"]):
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+            raise InputError(f"{path}, frame {index}: expected an object with a transform_matrix")
         try:
-            if not isinstance(frame, dict) or "transform_matrix" not in frame:
-                raise InputError("it has no transform_matrix")
-            camera = Camera(_intrinsics({**document, **frame}, size), _matrix(frame["transform_matrix"]))
+            camera = _camera(_calibration({**shared, **frame}), _matrix(frame["transform_matrix"]), size)
         except InputError as error:
-            raise InputError(f"{path}: frame {index}: {error}") from error
+            raise InputError(f"{path}, frame {index}: {error}") from error
         cameras.append(camera)
     return cameras
+
+
+def _camera(calibration: Calibration, c2w: np.ndarray, size: tuple[int, int] | None) -> Camera:
+    width, height = calibration.width, calibration.height
+    if width is None or height is None:
+        width, height = size or DEFAULT_SIZE
+    if max(width, height) > LARGEST_SIDE:
+        raise InputError(f"pictures have at most {LARGEST_SIDE} pixels a side, got {width}x{height}")
+    if all(focal is None for focal in (calibration.fx, calibration.fy, calibration.angle_x, calibration.angle_y)):
+        calibration = dataclasses.replace(calibration, angle_x=DEFAULT_ANGLE_X)
+    camera = Camera(calibration.intrinsics(width, height), c2w)
+    return camera.resized(*size) if size else camera
 
 
 def cameras_document(cameras: Sequence[Camera], names: Sequence[str]) -> dict[str, Any]:
@@ -92,7 +112,7 @@ def describe_orbit(cameras: Sequence[Camera], aabb: Any) -> dict[str, Any]:
 def orbit_cameras(count: int, description: Mapping[str, Any], size: tuple[int, int] | None) -> list[Camera]:
     """``count`` cameras on the orbit of :func:`describe_orbit` (missing keys: see :func:`default_orbit`)."""
     width, height = size or tuple(description.get("size") or DEFAULT_SIZE)
-    focal = 0.5 * width / math.tan(0.5 * float(description.get("camera_angle_x", _DEFAULT_ANGLE_X)))
+    focal = 0.5 * width / math.tan(0.5 * float(description.get("camera_angle_x", DEFAULT_ANGLE_X)))
     lens = Intrinsics(int(width), int(height), focal, focal, 0.5 * width, 0.5 * height)
     return orbit(
         count, center=description["center"], radius=float(description["radius"]),
@@ -104,38 +124,8 @@ def default_orbit(aabb: Any) -> dict[str, Any]:
     """An orbit that shows the whole box ``aabb`` (2, 3) from 25 degrees above, where no training camera is known."""
     box = np.asarray(aabb, dtype=np.float64)
     sphere = 0.5 * float(np.linalg.norm(box[1] - box[0]))
-    radius = sphere / math.sin(0.5 * _DEFAULT_ANGLE_X)
+    radius = sphere / math.sin(0.5 * DEFAULT_ANGLE_X)
     return {"center": box.mean(axis=0).tolist(), "radius": radius, "elevation_deg": 25.0}
-
-
-def _matrix(value: Any) -> np.ndarray:
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError("transform_matrix is not a 4x4 matrix of numbers") from error
-
-
-def _intrinsics(values: Mapping[str, Any], size: tuple[int, int] | None) -> Intrinsics:
-    def number(key: str, default: float) -> float:
-        value = values.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise InputError(f"{key} should be a number, got {value!r}")
-        return float(value)
-
-    default_width, default_height = size or DEFAULT_SIZE
-    width, height = number("w", default_width), number("h", default_height)
-    if not (1 <= width <= 16384 and 1 <= height <= 16384):
-        raise InputError(f"the picture size should be 1 to 16384 pixels a side, got {width:g}x{height:g}")
-    angle = number("camera_angle_x", _DEFAULT_ANGLE_X)
-    if not 0.0 < angle < math.pi:
-        raise InputError(f"camera_angle_x should lie between 0 and pi radians, got {angle:g}")
-    fx = number("fl_x", 0.5 * width / math.tan(0.5 * angle))
-    fy = number("fl_y", fx)
-    lens = Intrinsics(
-        int(width), int(height), fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height),
-        **{key: number(key, 0.0) for key in _LENS}, fisheye=values.get("camera_model") == "OPENCV_FISHEYE",
-    )  # fmt: skip
-    return lens.resized(*size) if size else lens
 
 
 def _nearest_point_to_axes(positions: np.ndarray, forwards: np.ndarray) -> np.ndarray | None:

@@ -128,7 +128,7 @@ def _build_parser() -> tuple[_Parser, dict[str, _Parser]]:
     _eval_arguments(command("eval", _eval, "Score an octree (PSNR, SSIM) on the views of a split."))
     _render_arguments(command("render", _render, "Render pictures or a video along a camera path."))
     info = command("info", _info, "Show what an octree file holds and which compute path runs here.")
-    info.add_argument("target", metavar="RUN|FILE", help="octree file, or a run folder that holds one")
+    info.add_argument("target", metavar="RUN|FILE", nargs="?", help="octree file or run folder; without: this machine")
     info.add_argument("--json", action="store_true", help="print JSON instead of text")
     subparsers.add_parser("synth", help="Make a synthetic scene with exact ground truth.", add_help=False)
     _bench_arguments(command("bench", _bench, "Measure rendering, loading and training speed."))

@@ -1,0 +1,76 @@
+"""What machine this is, for records that state figures."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+from nerfvol.options import usable_cores
+
+
+def cpu_model() -> str:
+    """The processor's name as the system tells it, else its architecture."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():
+            if line.startswith(("model name", "Model")):
+                return line.split(":", 1)[1].strip()
+    except OSError:  # no such file beside Linux
+        pass
+    return platform.processor() or platform.machine()
+
+
+def total_memory() -> int | None:
+    """Bytes of main memory, or the control group's limit where that is lower; None where nobody tells."""
+    try:
+        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return None
+    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        try:
+            text = Path(path).read_text().strip()
+        except OSError:  # not in such a group
+            continue
+        if text.isdigit():
+            total = min(total, int(text))
+    return total
+
+
+def available_memory() -> int | None:
+    """Bytes that a new allocation can take without swapping; None where nobody tells."""
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                free = int(line.split()[1]) * 1024
+                total = total_memory()
+                return free if total is None else min(free, total)
+    except (OSError, ValueError, IndexError):  # beside Linux
+        pass
+    return total_memory()
+
+
+def peak_memory() -> int | None:
+    """Largest resident size of this process so far, in bytes."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def describe_hardware() -> dict[str, Any]:
+    """cpu, usable cores, memory in GiB, platform and the kernels' build in use, JSON-able."""
+    from nerfvol.kernels import ops
+
+    total = total_memory()
+    return {
+        "cpu": cpu_model(),
+        "cores": usable_cores(),
+        "memory_gib": None if total is None else round(total / 2**30, 1),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "kernel_path": ops.isa(),
+    }

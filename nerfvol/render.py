@@ -1,0 +1,216 @@
+"""Pictures of an octree: one view at a time, in bands of tiles so that memory is bounded, to PNG, EXR or MP4."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol import pictures, runs
+from nerfvol.camera_paths import cameras_document, default_orbit, describe_orbit, load_cameras, orbit_cameras
+from nerfvol.cameras import TILE, Camera, Intrinsics
+from nerfvol.errors import InputError
+from nerfvol.files import ensure_writable_folder, write_json
+from nerfvol.kernels import ops
+from nerfvol.octree import Octree
+from nerfvol.octree_io import load_octree
+from nerfvol.options import DEFAULT_EARLY_STOP, RenderOptions
+
+BAND_RAYS = 1 << 20
+"""Rays rendered at once: some 50 MB of rays and results, whatever the picture's size."""
+_CHANNELS = {"rgb": (3,), "normal": (3,)}
+WHITE = (1.0, 1.0, 1.0)
+
+Float = NDArray[np.float32]
+
+
+def render_image(
+    octree: Octree,
+    camera: Camera,
+    background: Sequence[float] = WHITE,
+    early_stop_eps: float = DEFAULT_EARLY_STOP,
+    outputs: Sequence[str] = ops.OUTPUTS,
+) -> dict[str, Float]:
+    """One view: float32 arrays (H, W, 3) or (H, W) for the names in ``outputs`` (see ops.render_rays).
+
+    ``rgb`` is not clipped. Rays go to the kernel in 8x8 tiles, for which it is fast; tiles that reach beyond the
+    picture's edge are filled by repeating its last row and column, and cropped.
+    """
+    lens = camera.intrinsics
+    directions = _tiled_directions(lens)
+    rotation = camera.c2w[:3, :3].T.astype(np.float32)
+    origin = camera.c2w[:3, 3].astype(np.float32)
+    rows, columns = directions.shape[:2]
+    images = {name: np.empty((rows * TILE, columns * TILE, *_CHANNELS.get(name, ())), np.float32) for name in outputs}
+    rows_at_once = max(1, BAND_RAYS // (columns * TILE * TILE))
+    for top in range(0, rows, rows_at_once):
+        band = directions[top : top + rows_at_once]
+        origins = np.broadcast_to(origin, (len(band) * columns, 3))
+        result = ops.render_rays(octree, origins, band.reshape(-1, 3) @ rotation, background, early_stop_eps, outputs)
+        for name, image in images.items():
+            tiles = result[name].numpy().reshape(len(band), columns, TILE, TILE, *_CHANNELS.get(name, ()))
+            target = image[top * TILE : (top + len(band)) * TILE]
+            target.reshape(len(band), TILE, columns, TILE, *tiles.shape[4:])[:] = tiles.swapaxes(1, 2)
+    return {name: image[: lens.height, : lens.width] for name, image in images.items()}
+
+
+@functools.lru_cache(maxsize=1)
+def _tiled_directions(lens: Intrinsics) -> Float:
+    """Unit directions in camera axes, tile by tile: (rows of tiles, columns of tiles, 8, 8, 3). Kept for a path."""
+    directions = lens.directions()
+    padding = ((0, -lens.height % TILE), (0, -lens.width % TILE), (0, 0))
+    padded = np.pad(directions, padding, mode="edge") if padding != ((0, 0),) * 3 else directions
+    height, width = padded.shape[:2]
+    return np.ascontiguousarray(padded.reshape(height // TILE, TILE, width // TILE, TILE, 3).swapaxes(1, 2))
+
+
+def surface_depth(image: Mapping[str, Float]) -> Float:
+    """Mean distance (H, W) of what a pixel sees, sum_i w_i t_i / opacity; 0 where the opacity is below 1e-3."""
+    opacity = image["opacity"]
+    return np.where(opacity > 1e-3, image["depth"] / np.maximum(opacity, 1e-3), 0.0).astype(np.float32)
+
+
+def unit_normal(image: Mapping[str, Float]) -> Float:
+    """The mean normal (H, W, 3) at unit length; zero where there is none."""
+    normal = image["normal"]
+    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+
+
+def depth_range(octree: Octree, cameras: Sequence[Camera]) -> tuple[float, float]:
+    """Nearest and farthest distance at which any of ``cameras`` can meet a leaf of ``octree``."""
+    centers, reach = octree.leaf_centers(), octree.leaf_sizes() * (0.5 * 3**0.5)
+    low, high = (centers - reach[:, None]).min(axis=0), (centers + reach[:, None]).max(axis=0)
+    near, far = np.inf, 0.0
+    for camera in cameras:
+        eye = camera.position
+        near = min(near, float(np.linalg.norm(eye - np.clip(eye, low, high))))
+        far = max(far, float(np.linalg.norm(np.maximum(np.abs(eye - low), np.abs(eye - high)))))
+    return near, far
+
+
+# ------------------------------------------------------------------ the command
+def run_render(options: RenderOptions) -> int:
+    """``nerfvol render``: writes what the options ask for and prints where it is."""
+    out = Path(options.out)
+    is_video = out.suffix.lower() == ".mp4"
+    if (options.cameras is None) == (options.orbit is None):
+        raise InputError("nerfvol render needs either --cameras FILE.json or --orbit N")
+    if is_video and options.format == "exr":
+        raise InputError("--format exr writes pictures: give --out a folder, not a video file")
+    octree, metadata = load_octree(runs.octree_path(options.target))
+    background = resolve_background(options.background, options.target, metadata)
+    if options.cameras is not None:
+        cameras = load_cameras(options.cameras, options.size)
+    else:
+        assert options.orbit is not None
+        cameras = orbit_cameras(options.orbit, find_orbit(options.target, octree, metadata), options.size)
+    ensure_writable_folder(out.parent if is_video else out)
+    started = time.perf_counter()
+    frames = _frames(octree, cameras, background, options)
+    if is_video:
+        written = write_videos(out, frames, options.aov, options.fps, depth_range(octree, cameras))
+    else:
+        written = _write_pictures(out, frames, cameras, octree, options)
+    seconds = time.perf_counter() - started
+    where = ", ".join(map(str, written))
+    print(f"{len(cameras)} views in {seconds:.1f} s ({len(cameras) / seconds:.1f} a second): {where}")
+    return 0
+
+
+def resolve_background(given: Sequence[float] | None, target: str, metadata: Mapping[str, Any]) -> tuple[float, ...]:
+    """The background to render on: as given, else the run's, else the octree file's, else white."""
+    for candidate in (given, metadata.get("background"), runs.run_settings(target).get("background")):
+        if candidate is not None:
+            from nerfvol.config import Colour, coerce
+
+            return coerce(candidate, Colour, "background")
+    return WHITE
+
+
+def find_orbit(target: str, octree: Octree, metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The orbit stored with the octree, else that of the run's training cameras, else one that shows the octree."""
+    stored = metadata.get("orbit")
+    if isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys():
+        return stored
+    data = runs.run_settings(target).get("data")
+    if data and Path(data).exists():
+        from nerfvol.datasets import load_dataset
+
+        dataset = load_dataset(data, "train")
+        return describe_orbit(dataset.cameras, dataset.scene.aabb)
+    size = octree.leaf_sizes()[:, None]
+    center = octree.leaf_centers()
+    return default_orbit([(center - size / 2).min(axis=0), (center + size / 2).max(axis=0)])
+
+
+def _frames(
+    octree: Octree, cameras: Sequence[Camera], background: Sequence[float], options: RenderOptions
+) -> Iterator[dict[str, Float]]:
+    wanted = {"rgb"}
+    for name in options.aov:
+        wanted |= {"depth": {"depth", "opacity"}, "normal": {"normal", "opacity"}}.get(name, {name, "opacity"})
+    outputs = [name for name in ops.OUTPUTS if name in wanted]
+    for index, camera in enumerate(cameras):
+        if sys.stderr.isatty():
+            print(f"\rview {index + 1}/{len(cameras)}", end="", file=sys.stderr, flush=True)
+        image = render_image(octree, camera, background, options.early_stop_eps, outputs)
+        if "depth" in options.aov:
+            image["depth"] = surface_depth(image)
+        if "normal" in options.aov:
+            image["normal"] = unit_normal(image)
+        yield image
+    if sys.stderr.isatty():
+        print("\r", end="", file=sys.stderr)
+
+
+def write_videos(
+    path: Path, frames: Iterator[dict[str, Float]], aovs: Sequence[str], fps: int, depths: tuple[float, float]
+) -> list[Path]:
+    """One video of the colours at ``path`` and one for each AOV beside it; returns their paths."""
+    paths = {"rgb": path, **{name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in aovs}}
+    with contextlib.ExitStack() as stack:
+        writers = {name: stack.enter_context(pictures.open_video(p, fps)) for name, p in paths.items()}
+        for image in frames:
+            for name, writer in writers.items():
+                shown = _displayable(name, image, depths)
+                writer.add(shown if shown.ndim == 3 else np.repeat(shown[..., None], 3, axis=2))
+    return list(paths.values())
+
+
+def _displayable(name: str, image: Mapping[str, Float], depths: tuple[float, float]) -> Float:
+    """An output as values in [0, 1] that a person can read."""
+    if name in ("depth", "median_depth"):
+        return pictures.depth_to_grey(image[name], image["opacity"], *depths)
+    if name == "normal":
+        return pictures.normal_to_rgb(image[name], image["opacity"])
+    return image[name]
+
+
+def _write_pictures(
+    out: Path, frames: Iterator[dict[str, Float]], cameras: Sequence[Camera], octree: Octree, options: RenderOptions
+) -> list[Path]:
+    depths = depth_range(octree, cameras)
+    digits = max(4, len(str(len(cameras) - 1)))
+    names = [f"{index:0{digits}d}" for index in range(len(cameras))]
+    for name, image in zip(names, frames, strict=True):
+        if options.format == "exr":
+            channels = {"RGB": pictures.srgb_to_linear(image["rgb"])}
+            exr_names = {"opacity": "A", "depth": "Z", "median_depth": "median.Z", "normal": "N"}
+            channels.update({exr_names[aov]: image[aov] for aov in options.aov})
+            pictures.write_exr(out / f"{name}.exr", channels)
+            continue
+        pictures.write_png(out / f"{name}.png", image["rgb"])
+        for aov in options.aov:
+            pictures.write_png(out / f"{name}_{aov}.png", _displayable(aov, image, depths))
+    document = cameras_document(cameras, [f"{name}.{options.format}" for name in names])
+    if options.format == "png" and {"depth", "median_depth"} & set(options.aov):
+        document["depth_range"] = depths
+    write_json(out / "cameras.json", document)
+    return [out]
