@@ -6,7 +6,6 @@ camera-to-world ``transform_matrix`` in OpenGL axes. Formats and sources: docs/d
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from nerfvol.cameras import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.frames import Calibration, Frame, ImageFinder, Listing, hold_out
 from nerfvol.errors import InputError
+from nerfvol.files import read_json
 
 _SPLITS = ("train", "val", "test")
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -76,16 +76,7 @@ def _read_file(path: Path) -> tuple[list[Frame], BoundsHint]:
 
 
 def _load_json(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: expected a transforms*.json with camera poses, but there is no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON text, but it cannot be read ({error})") from error
-    try:
-        data = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON, but it does not parse ({error})") from error
+    data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f'{path}: expected a JSON object with a non-empty list "frames"')
     return data
