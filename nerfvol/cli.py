@@ -50,8 +50,13 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` (default: that of the process) and return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
+    return guard(lambda: _dispatch(arguments))
+
+
+def guard(run: Callable[[], int]) -> int:
+    """The exit code of ``run``; what the user has to put right is said in one sentence instead of a traceback."""
     try:
-        code = _dispatch(arguments)
+        code = run()
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:
