@@ -61,8 +61,12 @@ Colour = Annotated[tuple[float, float, float], colour]
 
 
 def positive(value: Any) -> Any:
-    """Refuses numbers below 1 (counts, sizes)."""
-    if isinstance(value, (int, float)) and value < 1:
+    """Refuses numbers below 1 (counts, sizes); what is no number is for the type's own check to refuse."""
+    try:
+        too_small = float(value) < 1
+    except (TypeError, ValueError):
+        return value
+    if too_small:
         raise ValueError(f"expected a number of at least 1, got {value!r}")
     return value
 

@@ -44,7 +44,7 @@ def run_demo(config_file: Path, folder: Path) -> int:
     print(
         f"\nDone in {time.perf_counter() - started:.0f} s: PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on "
         f"{scores['n_images']} views that were held out, {scores['seconds_per_frame']:.3f} s per frame\n"
-        f"  pictures  {folder / 'comparison.png'} (truth | render | error | depth), all views in {folder / 'pictures'}\n"
+        f"  pictures  {folder / 'comparison.png'} (truth | render | error | depth); all: {folder / 'pictures'}\n"
         f"  video     {video}\n"
         f"  scores    {folder / 'scores.json'}\n"
         f"  octree    {octree_file} ({octree_file.stat().st_size / 1e6:.0f} MB)"
