@@ -60,6 +60,13 @@ def _radial(s: Float, c: Coefficients) -> tuple[Float, Float]:
     return value, slope
 
 
+def _fold(c: Coefficients) -> float:
+    """The radius (or angle) at which r (1 + k1 r^2 + ...) first turns back; beyond it lie false branches."""
+    roots = np.roots([1.0, 3 * c[0], 5 * c[1], 7 * c[2], 9 * c[3]])  # the derivative's, in 1 / r^2
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    return float(1 / np.sqrt(real.max())) if len(real) else np.inf
+
+
 def _brown(plane: Float, c: Coefficients) -> Float:
     x, y = plane[:, 0], plane[:, 1]
     p1, p2 = c[4], c[5]
@@ -88,7 +95,7 @@ def _solve_brown(plane: Float, c: Coefficients) -> Float:
         safe = np.where(good, det, 1.0)
         x = np.where(good, x - (jyy * ex - jxy * ey) / safe, _PULL * x)
         y = np.where(good, y - (jxx * ey - jxy * ex) / safe, _PULL * y)
-        if done.all():
+        if done.all() and np.sqrt(x * x + y * y).max(initial=0.0) <= _fold(c):
             return np.stack([x, y], axis=1)
     raise _no_inverse(plane, c, "pinhole")
 
@@ -108,7 +115,7 @@ def _solve_fisheye(theta_d: Float, c: Coefficients) -> Float:
         good = (slope > 0) & (theta <= np.pi)
         done = good & (np.abs(error) <= TOLERANCE * (1 + theta))
         theta = np.where(good, theta - error / np.where(good, slope, 1.0), _PULL * theta)
-        if done.all():
+        if done.all() and theta.max(initial=0.0) <= _fold(c):
             return theta
     raise _no_inverse(theta_d[:, None], c, "fisheye")
 
