@@ -134,4 +134,5 @@ class HashGrid(nn.Module):
         """(n, 3) in [0, 1]**3 (outside is clamped) -> (n, n_levels * n_features), coarse level first."""
         indices, weights = self.corners(p)
         features = _TableLookup.apply(self.table, indices.reshape(8, -1), weights.reshape(8, -1))
-        return features.view(len(self.resolutions), len(p), self.n_features).transpose(0, 1).reshape(len(p), -1)
+        by_level = features.view(len(self.resolutions), len(p), self.n_features)
+        return by_level.transpose(0, 1).reshape(len(p), self.out_dim)

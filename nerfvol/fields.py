@@ -33,6 +33,7 @@ class RadianceField(Protocol):
 class SHField(RadianceField, Protocol):
     """A field whose view dependence is spherical harmonics: it distils into an octree without sampling directions."""
 
+    has_sh: bool
     sh_degree: int
 
     def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,7 +169,8 @@ class NeuralField(nn.Module):
     def __init__(self, domain: Domain, shape: FieldShape, encoding: nn.Module) -> None:
         super().__init__()
         self.domain, self.shape, self.encoding = domain, shape, encoding
-        self.sh_degree = shape.sh_degree if shape.head == "sh" else 0
+        self.has_sh = shape.head == "sh"
+        self.sh_degree = shape.sh_degree if self.has_sh else 0
         self.trunk = _Trunk(encoding.out_dim, shape.width, shape.depth, shape.skip)
         self.density_scale = 1 / (2 * domain.half)
         if shape.head == "sh":
@@ -204,7 +206,7 @@ class NeuralField(nn.Module):
         if self.shape.head != "sh":
             raise ValueError("this field has a view-dependent rgb head: it has no SH coefficients to give")
         sigma, flat = self._features(positions)
-        return sigma, flat.reshape(len(flat), 3, -1).to(sigma.dtype)
+        return sigma, flat.reshape(len(flat), 3, spherical.basis_dim(self.sh_degree)).to(sigma.dtype)
 
     def forward(self, positions: Tensor, viewdirs: Tensor) -> tuple[Tensor, Tensor]:
         """(n, 3), (n, 3) unit -> sigma (n,) in 1/u, rgb (n, 3)."""

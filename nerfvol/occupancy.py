@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain
+from nerfvol.fields import Domain, NeuralField
 from nerfvol.sampling import intersect_aabb
 
 _GROUP = 8  # steps tested at once against the coarse grid
@@ -62,7 +62,7 @@ class OccupancyGrid:
         decay: what a visit leaves of the remembered coefficient.
     """
 
-    def __init__(self, domain: Domain, resolution: int = 64, threshold: float = 0.01, decay: float = 0.95) -> None:
+    def __init__(self, domain: Domain, resolution: int = 64, threshold: float = 0.04, decay: float = 0.8) -> None:
         if resolution % _POOL:
             raise ValueError(f"resolution must be a multiple of {_POOL}, got {resolution}")
         self.domain, self.resolution, self.threshold, self.decay = domain, resolution, threshold, decay
@@ -70,7 +70,7 @@ class OccupancyGrid:
         edge = 2 * domain.half / resolution
         self.cell_edges = edge * 2.0 ** torch.arange(self.n_cubes)
         # Start above the threshold everywhere: a cell has to be seen empty several times before it is skipped.
-        self.sigmas = (10 * threshold / self.cell_edges).repeat_interleave(resolution**3)
+        self.sigmas = (2 * threshold / self.cell_edges).repeat_interleave(resolution**3)
         self.refresh()
 
     def refresh(self) -> None:
@@ -206,3 +206,40 @@ class OccupancyGrid:
                 expected, got = f"{mine.dtype} {tuple(mine.shape)}", f"{given.dtype} {tuple(given.shape)}"
                 raise InputError(f"occupancy grid of the checkpoint: {name} must be {expected}, got {got}")
             setattr(self, name, given.clone())
+
+
+class OccupiedField:
+    """A field that is empty where an occupancy grid says so, as it was in training; the rest is the field's own.
+
+    What lies in cells that training skips is whatever the network happens to hold there. Points in skipped cells cost
+    nothing here.
+    """
+
+    def __init__(self, field: NeuralField, grid: OccupancyGrid) -> None:
+        self.field, self.grid = field, grid
+        self.has_sh = field.has_sh
+        self.sh_degree = field.sh_degree
+
+    def _inside(self, positions: Tensor) -> Tensor:
+        return self.grid.occupied[self.grid.cells_at(positions)].nonzero()[:, 0]
+
+    def density(self, positions: Tensor) -> Tensor:
+        """(n, 3) -> sigma (n,) in 1/u."""
+        inside = self._inside(positions)
+        sigma = positions.new_zeros(len(positions))
+        return sigma.index_copy(0, inside, self.field.density(positions[inside]))
+
+    def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """(n, 3) -> sigma (n,), sh (n, 3, basis_dim)."""
+        inside = self._inside(positions)
+        sigma, sh = self.field.sh(positions[inside])
+        zeros = positions.new_zeros(len(positions))
+        coefficients = zeros[:, None, None].expand(-1, *sh.shape[1:]).clone()
+        return zeros.index_copy(0, inside, sigma), coefficients.index_copy(0, inside, sh)
+
+    def __call__(self, positions: Tensor, viewdirs: Tensor) -> tuple[Tensor, Tensor]:
+        """(n, 3), (n, 3) unit -> sigma (n,), rgb (n, 3)."""
+        inside = self._inside(positions)
+        sigma, rgb = self.field(positions[inside], viewdirs[inside])
+        zeros = positions.new_zeros(len(positions))
+        return zeros.index_copy(0, inside, sigma), torch.zeros_like(positions).index_copy(0, inside, rgb)

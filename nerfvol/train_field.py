@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain, FieldShape, RadianceField, make_field
-from nerfvol.occupancy import OccupancyGrid, Samples, StepSchedule
+from nerfvol.fields import Domain, FieldShape, NeuralField, RadianceField, make_field
+from nerfvol.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
 from nerfvol.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
 
@@ -234,6 +234,10 @@ class FieldTrainer:
             return importance_samples(self.field, rays_o, rays_d, span, counts, generator)
         jitter = None if generator is None else torch.rand(len(rays_o), generator=generator)
         return self.grid.march(rays_o, rays_d, self.schedule, near_plane, jitter)
+
+    def trained_field(self) -> NeuralField | OccupiedField:
+        """The field without what it holds in space that training skips: what is to be rendered or distilled."""
+        return OccupiedField(self.field, self.grid) if self.config.sampler == "occupancy" else self.field
 
     def render(self, rays_o: Tensor, rays_d: Tensor, chunk: int = 4096) -> dict[str, Tensor]:
         """``render_field`` of the field as it is now."""

@@ -1,0 +1,419 @@
+"""Distillation: a radiance field becomes a sparse octree of several leaf sizes, and what that costs is measured.
+
+1. Candidates: the field is looked at in coarse cells; only cells that hold something, and their neighbours, are looked
+   at again at half the size, down to the finest level (outside the region of detail: the coarser the farther out).
+2. Values: coefficient and spherical harmonics at the leaves' vertices, averaged over the vertex's surroundings.
+3. Merging: eight leaves whose values the parent's own corners reproduce become one. Done before pruning, so that thin
+   haze is judged by large leaves, in which it has weight.
+4. Visibility: the training rays are rendered, and leaves no ray needs are removed [PlenOctrees, section 4].
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfvol import sh as spherical
+from nerfvol.cameras import Camera
+from nerfvol.datasets import Dataset
+from nerfvol.errors import InputError
+from nerfvol.fields import Domain, RadianceField
+from nerfvol.kernels import ops
+from nerfvol.metrics import psnr
+from nerfvol.octree import EMPTY_DENSITY, OFFSETS, Octree, explin, explin_inverse
+from nerfvol.render import render_image
+from nerfvol.tiles import TileBank
+
+_CHUNK = 32768  # points of one evaluation of the field
+_FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
+
+
+@dataclasses.dataclass
+class DistillConfig:
+    """How a field is made into an octree."""
+
+    level: int = 8
+    """Finest leaves: 2**level along an edge of the detail cube."""
+    coarse_level: int = 5
+    """Where the search begins; also the coarsest leaves that merging makes in the detail cube."""
+    sh_degree: int = 1
+    density_scale: float = 300.0
+    """Coefficient that a raw density of 1 means, per edge of the detail cube."""
+    empty_opacity: float = 5e-4
+    """A cell is empty where a finest leaf of its largest coefficient would be less opaque than this."""
+    merge_tolerance: float = 0.01
+    """Largest error, in opacity of a leaf and in its colour, that merging may cause; 0 keeps all leaves at one size."""
+    prune_weight: float = 0.005
+    """Leaves whose largest rendering weight over the training rays is below are removed; 0 keeps all."""
+    samples_per_vertex: int = 8
+    """Field samples averaged into a vertex: 1 (the vertex itself) or 8."""
+    max_leaves: int = 8_000_000
+    """Refinement stops before there are more candidates than this."""
+    visibility_downscale: int = 4
+    compare_downscale: int = 4
+    compare_views: int = 4
+    """Views, and their size, for the comparison of field and octree."""
+
+
+@dataclasses.dataclass
+class DistillReport:
+    """What came out and what was lost; PSNR in dB over the same views of the dataset."""
+
+    leaves: int
+    vertices: int
+    leaves_per_level: dict[int, int]
+    bytes: int
+    candidates: int
+    merged: int
+    pruned: int
+    field_psnr: float
+    octree_psnr: float
+    messages: list[str]
+
+    @property
+    def lost_db(self) -> float:
+        """PSNR of the field minus PSNR of the octree."""
+        return self.field_psnr - self.octree_psnr
+
+    def __str__(self) -> str:
+        levels = ", ".join(f"{n} at level {level}" for level, n in self.leaves_per_level.items())
+        return (
+            f"distilled {self.leaves} leaves ({levels}), {self.vertices} vertices, {self.bytes / 1e6:.1f} MB; "
+            f"field {self.field_psnr:.2f} dB, octree {self.octree_psnr:.2f} dB on the same views: "
+            f"{self.lost_db:.2f} dB lost"
+        )
+
+
+def distill(
+    field: RadianceField,
+    domain: Domain,
+    dataset: Dataset,
+    background: Sequence[float],
+    config: DistillConfig,
+    render_field: Callable[[Camera], np.ndarray] | None = None,
+) -> tuple[Octree, DistillReport]:
+    """Octree of a field.
+
+    Args:
+        field: with an SH head (``field.sh``), or any field, whose colour is then projected on SH by quadrature.
+        domain: the field's region.
+        dataset: the training views: they decide what is visible, and some serve for the comparison.
+        background: RGB behind the scene.
+        render_field: camera -> (h, w, 3) image of the field; None: no comparison is made (PSNRs are NaN).
+
+    Raises:
+        InputError: the field is empty: nothing in it is as opaque as ``empty_opacity``.
+    """
+    messages: list[str] = []
+    frame = Frame.of(domain, config.level)
+    level, ijk = candidate_cells(field, frame, config, messages)
+    octree = Octree.from_leaves(
+        level, ijk, frame.origin, frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
+    )
+    write_values(octree, field, config.samples_per_vertex)
+    candidates = octree.n_leaves
+    octree = merge_smooth(octree, config.coarse_level, config.merge_tolerance)
+    merged = octree.n_leaves
+    if config.prune_weight > 0:
+        weights = largest_weights(octree, dataset, background, config.visibility_downscale)
+        keep = weights >= config.prune_weight
+        if not keep.any():
+            raise InputError(
+                "the field holds nothing that the training views can see; train it longer or use --init direct"
+            )
+        octree, _ = octree.prune(keep)
+    scores = (math.nan, math.nan)
+    if render_field is not None:
+        scores = compare(octree, dataset, background, render_field, config)
+    levels, counts = np.unique(octree.leaf_level, return_counts=True)
+    report = DistillReport(
+        leaves=octree.n_leaves, vertices=octree.n_vertices,
+        leaves_per_level=dict(zip(levels.tolist(), counts.tolist(), strict=True)),
+        bytes=octree.values.nbytes + octree.corners.nbytes, candidates=candidates, merged=candidates - merged,
+        pruned=merged - octree.n_leaves, field_psnr=scores[0], octree_psnr=scores[1], messages=messages,
+    )  # fmt: skip
+    return octree, report
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """The octree's root cube, and how fine it is where.
+
+    origin (3,), size: the root cube. finest: the level of leaves in the detail cube. center, half: the detail cube.
+    """
+
+    origin: np.ndarray
+    size: float
+    finest: int
+    center: np.ndarray
+    half: float
+
+    @classmethod
+    def of(cls, domain: Domain, level: int) -> Frame:
+        """The detail cube itself, or the smallest power-of-two multiple of it that holds the background."""
+        doublings = max(0, math.ceil(math.log2(domain.outer) - 1e-6))
+        center, size = np.array(domain.center), 2 * domain.half * 2.0**doublings
+        return cls(center - size / 2, size, level + doublings, center, domain.half)
+
+    def wanted_level(self, level: int, ijk: np.ndarray) -> np.ndarray:
+        """(n,) finest level wanted in cells (n, 3) of ``level``: one less at each doubling of the distance."""
+        edge = self.size / 2**level
+        low = self.origin + ijk * edge - self.center
+        nearest = np.maximum(np.maximum(low, -(low + edge)), 0).max(1)  # Chebyshev distance of the cell's nearest point
+        shells = np.ceil(np.log2(np.maximum(nearest / self.half + 1e-9, 1)) - 1e-6)
+        # A cell that touches the detail cube from outside belongs to the first shell.
+        outside = nearest >= self.half * (1 - 1e-9)
+        return self.finest - np.where(outside, np.maximum(shells, 1), 0).astype(np.int64)
+
+
+@torch.no_grad()
+def evaluate(function: Callable[[Tensor], Tensor], positions: np.ndarray) -> np.ndarray:
+    """``function`` of positions (n, 3), in chunks; the result as one array of n rows."""
+    points = torch.from_numpy(np.ascontiguousarray(positions, dtype=np.float32))
+    return torch.cat([function(part) for part in points.split(_CHUNK)]).numpy()
+
+
+def candidate_cells(
+    field: RadianceField, frame: Frame, config: DistillConfig, messages: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Levels (n,) and positions (n, 3) of the cells that may hold something, found from coarse to fine."""
+    start = max(1, config.coarse_level + frame.finest - config.level)
+    start = min(start, frame.finest, 6 if frame.finest > config.level else start)
+    cells = np.stack(np.meshgrid(*[np.arange(1 << start)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    threshold = -math.log1p(-config.empty_opacity)
+    done: list[tuple[int, np.ndarray]] = []
+    for level in range(start, frame.finest + 1):
+        wanted = frame.wanted_level(level, cells)
+        edge = frame.size / 2**level
+        per_axis = 4 if level == start else 2
+        sigmas = largest_sigma(field, frame.origin + cells * edge, edge, per_axis)
+        # Thickness of the leaf this cell would be cut into.
+        holds = sigmas * (frame.size / 2.0 ** np.maximum(wanted, level)) > threshold
+        kept = dilated(cells, holds, 1 << level)
+        finished = wanted[kept] <= level
+        done.append((level, cells[kept][finished]))
+        cells = cells[kept][~finished]
+        total = sum(len(part) for _, part in done)
+        if level < frame.finest and total + 8 * len(cells) > config.max_leaves:
+            messages.append(f"refinement stopped at level {level}: more than {config.max_leaves} cells hold something")
+            done.append((level, cells))
+            break
+        cells = (2 * cells[:, None] + OFFSETS).reshape(-1, 3)
+    levels = np.concatenate([np.full(len(part), level) for level, part in done])
+    if not len(levels):
+        raise InputError(
+            "the field is empty: nothing in it is opaque enough for a leaf; train it longer, check the background "
+            "colour and the scene bounds, or use --init direct"
+        )
+    return levels, np.concatenate([part for _, part in done])
+
+
+def largest_sigma(field: RadianceField, corners: np.ndarray, edge: float, per_axis: int) -> np.ndarray:
+    """Largest coefficient among per_axis**3 evenly spaced points in each cell; corners (n, 3) -> (n,)."""
+    steps = (np.arange(per_axis) + 0.5) / per_axis * edge
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    best = np.zeros(len(corners), dtype=np.float32)
+    for offset in offsets:
+        np.maximum(best, evaluate(field.density, corners + offset), out=best)
+    return best
+
+
+def dilated(cells: np.ndarray, holds: np.ndarray, n: int) -> np.ndarray:
+    """Cells (m, 3) of an n**3 grid that hold something or touch one that does: (m,) bool."""
+
+    def key(ijk: np.ndarray) -> np.ndarray:
+        return (ijk[:, 0] * (n + 2) + ijk[:, 1]) * (n + 2) + ijk[:, 2]
+
+    keys = key(cells + 1)
+    occupied = np.sort(keys[holds])
+    kept = holds.copy()
+    if not len(occupied):
+        return kept
+    for offset in _FACES:
+        rest = np.flatnonzero(~kept)
+        wanted = keys[rest] + (offset[0] * (n + 2) + offset[1]) * (n + 2) + offset[2]
+        place = np.minimum(np.searchsorted(occupied, wanted), len(occupied) - 1)
+        kept[rest[occupied[place] == wanted]] = True
+    return kept
+
+
+def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int = 8) -> None:
+    """Fill an octree's vertices from a field.
+
+    With 8 samples a vertex is the mean over the middles of the eight cells around it, of half the size of the finest
+    leaf that has the vertex; colour is weighted by the coefficient, so that space in front of a surface has its colour.
+    """
+    if samples_per_vertex not in (1, 8):
+        raise ValueError(f"samples_per_vertex must be 1 or 8, got {samples_per_vertex}")
+    positions = octree.vertex_positions()
+    spacing = np.full(octree.n_vertices, np.inf)
+    np.minimum.at(spacing, octree.corners.reshape(-1), np.repeat(octree.leaf_sizes(), 8))
+    to_sh = sh_of(field, octree.sh_degree)
+    offsets = (OFFSETS - 0.5) / 2 if samples_per_vertex == 8 else np.zeros((1, 3))
+    sigma_sum = np.zeros(octree.n_vertices)
+    sh_sum = np.zeros((octree.n_vertices, 3 * spherical.basis_dim(octree.sh_degree)))
+    for offset in offsets:
+        rows = evaluate(to_sh, positions + spacing[:, None] * offset)
+        sigma_sum += rows[:, 0]
+        sh_sum += (rows[:, :1] + 1e-6) * rows[:, 1:]
+    octree.sh = (sh_sum / (sigma_sum + 1e-6 * len(offsets))[:, None]).reshape(octree.n_vertices, 3, -1)
+    # Beyond an optical thickness of 20 a leaf is opaque: larger numbers change nothing and are hard to optimise.
+    sigma = np.minimum(sigma_sum / len(offsets), 20 / spacing)
+    octree.density = np.maximum(explin_inverse(np.maximum(sigma / octree.density_scale, 1e-30)), EMPTY_DENSITY)
+
+
+def sh_of(field: RadianceField, degree: int) -> Callable[[Tensor], Tensor]:
+    """Function from positions (n, 3) to rows (n, 1 + 3 * basis_dim): coefficient, then SH by channel."""
+    dim = spherical.basis_dim(degree)
+    if getattr(field, "has_sh", False):
+
+        def from_head(points: Tensor) -> Tensor:
+            sigma, sh = field.sh(points)
+            rows = points.new_zeros(len(points), 3, dim)
+            shared = min(dim, sh.shape[-1])
+            rows[..., :shared] = sh[..., :shared]
+            return torch.cat([sigma[:, None], rows.flatten(1)], dim=1)
+
+        return from_head
+    dirs, weights = _sphere(degree + 3)
+    projector = (weights[:, None] * spherical.eval_basis(degree, dirs)).float()
+
+    def by_quadrature(points: Tensor) -> Tensor:
+        rows = points.new_zeros(len(points), 3, dim)
+        sigma = points.new_zeros(len(points))
+        for direction, row in zip(dirs.float(), projector, strict=True):
+            sigma, rgb = field(points, direction.expand_as(points))
+            rows += (rgb - 0.5)[..., None] * row
+        return torch.cat([sigma[:, None], rows.flatten(1)], dim=1)
+
+    return by_quadrature
+
+
+def _sphere(n: int) -> tuple[Tensor, Tensor]:
+    """Directions and weights of a product quadrature, exact for polynomials of degree < 2 n."""
+    z, w = np.polynomial.legendre.leggauss(n)
+    z, phi = (a.reshape(-1) for a in np.meshgrid(z, np.pi * np.arange(2 * n) / n, indexing="ij"))
+    s = np.sqrt(1 - z * z)
+    dirs = np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1)
+    return torch.from_numpy(dirs), torch.from_numpy(np.repeat(w, 2 * n) * np.pi / n)
+
+
+def merge_smooth(octree: Octree, coarsest: int, tolerance: float) -> Octree:
+    """Replace eight sibling leaves by one where its trilinear field is theirs to within ``tolerance``.
+
+    The error is the largest, over the 27 points of the siblings' lattice, of the change in opacity of a sibling and of
+    the change in colour times the sibling's opacity. Repeats level by level, up to leaves of level ``coarsest``.
+    """
+    for level in range(octree.max_level, max(coarsest, 1), -1):
+        if tolerance <= 0:
+            break
+        rows = np.flatnonzero(octree.leaf_level == level)
+        parents, members, counts = np.unique(
+            _keys(octree.leaf_ijk[rows] >> 1, level), return_inverse=True, return_counts=True
+        )
+        full = counts[members] == 8
+        rows, members = rows[full], members[full]
+        if not len(rows):
+            continue
+        # Siblings in octant order: (m, 8) leaf numbers.
+        octant = (octree.leaf_ijk[rows] & 1) @ np.array([4, 2, 1])
+        families = rows[np.lexsort((octant, members))].reshape(-1, 8)
+        smooth = np.concatenate(
+            [_merge_error(octree, part) <= tolerance for part in np.array_split(families, 1 + len(families) // 50000)]
+        )
+        if not smooth.any():
+            continue
+        octree = _merged(octree, families[smooth])
+    return octree
+
+
+def _keys(ijk: np.ndarray, level: int) -> np.ndarray:
+    return (ijk[:, 0] << 2 * level) + (ijk[:, 1] << level) + ijk[:, 2]
+
+
+_LATTICE = np.array(list(np.ndindex(3, 3, 3)))
+_LATTICE_OF_CORNER = (OFFSETS[:, None] + OFFSETS[None]) @ np.array([9, 3, 1])  # (child, corner) -> lattice point
+_PARENT_WEIGHTS = np.prod(
+    np.where(OFFSETS[None] == 1, _LATTICE[:, None] / 2, 1 - _LATTICE[:, None] / 2), axis=-1
+)  # (27, 8)
+
+
+def _merge_error(octree: Octree, families: np.ndarray) -> np.ndarray:
+    """(m,) error of replacing families (m, 8) by their parents."""
+    vertices = np.empty((len(families), 27), dtype=np.int64)
+    vertices[:, _LATTICE_OF_CORNER.reshape(-1)] = octree.corners[families].reshape(len(families), 64)
+    corners = vertices[:, (OFFSETS * 2) @ np.array([9, 3, 1])]
+    edge = octree.leaf_sizes()[families[:, :1]]
+    scale = octree.density_scale * edge
+    raw = octree.density.astype(np.float32)
+    truth = -np.expm1(-scale * explin(raw[vertices]))
+    guess = -np.expm1(-scale * explin(raw[corners] @ _PARENT_WEIGHTS.T.astype(np.float32)))
+    error = np.abs(guess - truth).max(1)
+    sh = octree.sh
+    for channel in range(3):
+        for k in range(sh.shape[-1]):
+            own = sh[:, channel, k]
+            change = np.abs(own[corners] @ _PARENT_WEIGHTS.T.astype(np.float32) - own[vertices])
+            # |Y_k| <= sqrt((2 l + 1) / (4 pi))
+            bound = math.sqrt((2 * math.isqrt(k) + 1) / (4 * math.pi))
+            error = np.maximum(error, bound * (change * truth).max(1))
+    return error
+
+
+def _merged(octree: Octree, families: np.ndarray) -> Octree:
+    """The octree with families (m, 8) of leaves replaced by their parents; values of kept vertices are copied."""
+    gone = np.zeros(octree.n_leaves, dtype=bool)
+    gone[families.reshape(-1)] = True
+    level = np.concatenate([octree.leaf_level[~gone], octree.leaf_level[families[:, 0]] - 1])
+    ijk = np.concatenate([octree.leaf_ijk[~gone], octree.leaf_ijk[families[:, 0]] >> 1])
+    new = Octree.from_leaves(level, ijk, octree.origin, octree.size, octree.sh_degree, octree.density_scale)
+    finest = octree.max_level
+
+    def lattice(tree: Octree) -> np.ndarray:
+        at = np.rint((tree.vertex_positions() - octree.origin) * (2.0**finest / octree.size)).astype(np.int64)
+        return (at[:, 0] << 40) + (at[:, 1] << 20) + at[:, 2]
+
+    old = lattice(octree)
+    order = np.argsort(old)
+    new.values[:] = octree.values[order[np.searchsorted(old[order], lattice(new))]]
+    return new
+
+
+def largest_weights(octree: Octree, dataset: Dataset, background: Sequence[float], downscale: int) -> np.ndarray:
+    """(n_leaves,) largest rendering weight of each leaf over all rays of the dataset at 1/downscale of its size."""
+    bank = TileBank(dataset, background, downscale)
+    state = ops.TrainState(octree)
+    options, still = ops.LossOptions(tuple(background), early_stop_eps=1e-3), ops.Rates(0.0, 0.0, 0.0)
+    for tiles in np.array_split(np.arange(bank.n_tiles), max(1, bank.n_tiles // 512)):
+        # A training step with rates of zero: it moves nothing and notes the weights.
+        batch = bank.batch(tiles, np.ones(len(tiles), dtype=np.float32))
+        ops.train_step(octree, state, batch, options, still, bank.pixel_angle)
+    return state.max_weight
+
+
+def compare(
+    octree: Octree,
+    dataset: Dataset,
+    background: Sequence[float],
+    render_field: Callable[[Camera], np.ndarray],
+    config: DistillConfig,
+) -> tuple[float, float]:
+    """Mean PSNR (dB) of the field and of the octree on the same evenly chosen views of the dataset."""
+    count = min(config.compare_views, len(dataset.cameras))
+    chosen = np.linspace(0, len(dataset.cameras) - 1, count).round().astype(int)
+    smaller = dataclasses.replace(
+        dataset, cameras=[dataset.cameras[i] for i in chosen], images=[dataset.images[i] for i in chosen],
+        names=[dataset.names[i] for i in chosen],
+    )  # fmt: skip
+    rows = []
+    for camera, image in zip(smaller.cameras, smaller.pyramid(background, config.compare_downscale), strict=True):
+        camera, truth = camera.scaled(config.compare_downscale), image.astype(np.float32) / 255
+        mine = render_image(octree, camera, background, 0.0, ("rgb",))["rgb"]
+        rows.append([psnr(np.clip(np.asarray(picture), 0, 1), truth) for picture in (render_field(camera), mine)])
+    field_psnr, octree_psnr = np.mean(rows, axis=0)
+    return float(field_psnr), float(octree_psnr)
