@@ -16,18 +16,22 @@ TINY_SIZE = 40
 TINY_RADIUS = 0.8
 
 
-def sphere_image(camera, colour):
-    """RGBA float (H, W, 4) of the sphere of TINY_RADIUS at the origin, its colour a function of the hit point."""
+def sphere_image(camera, colour, samples=4):
+    """RGBA (H, W, 4), straight alpha, of the sphere of TINY_RADIUS at the origin, from samples^2 rays a pixel."""
     lens = camera.intrinsics
-    origin, directions = camera.rays_at(
-        np.stack(np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5), -1).reshape(-1, 2)
-    )
-    b = directions @ origin
-    discriminant = b * b - (origin @ origin - TINY_RADIUS**2)
-    hit = discriminant > 0
-    points = origin + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * directions
-    image = np.concatenate([np.where(hit[:, None], colour(points), 0.0), hit[:, None]], axis=1)
-    return image.reshape(lens.height, lens.width, 4)
+    offsets = (np.arange(samples) + 0.5) / samples
+    total = np.zeros((lens.height * lens.width, 4))
+    for dx in offsets:
+        for dy in offsets:
+            pixels = np.stack(np.meshgrid(np.arange(lens.width) + dx, np.arange(lens.height) + dy), -1).reshape(-1, 2)
+            origin, directions = camera.rays_at(pixels)
+            b = directions @ origin
+            discriminant = b * b - (origin @ origin - TINY_RADIUS**2)
+            hit = (discriminant > 0)[:, None]
+            points = origin + (-b - np.sqrt(np.maximum(discriminant, 0)))[:, None] * directions
+            total += np.concatenate([np.where(hit, colour(points), 0.0), hit], axis=1) / samples**2
+    total[:, :3] /= np.maximum(total[:, 3:], 1e-9)
+    return total.reshape(lens.height, lens.width, 4)
 
 
 def sphere_colour(points):

@@ -1,0 +1,242 @@
+"""``nerfvol bench``: repeatable medians of loading, rendering and training speed, and what they stand against.
+
+Views are those of the octree's own orbit. Training steps run at learning rate zero on tiles of such views, so that the
+octree under measurement stays what it is while every byte is touched as in training. Coarser octrees for the cost
+against size are made from the given one, level by level.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfvol import __version__, runs
+from nerfvol.camera_paths import orbit_cameras
+from nerfvol.cameras import Camera, tile_pixels
+from nerfvol.files import ensure_writable_folder, write_json
+from nerfvol.kernels import ops
+from nerfvol.machine import describe_hardware
+from nerfvol.octree import EMPTY_DENSITY, Octree
+from nerfvol.octree_io import load_octree
+from nerfvol.options import DEFAULT_EARLY_STOP, BenchOptions, usable_cores
+from nerfvol.render import WHITE, find_orbit, render_image
+
+VIEWS = 4
+BASE_SIZE = 800
+TRAIN_TILES = 512
+REFERENCE_RAYS = 2048
+PAPER_SAMPLES = (64, 192)
+"""Field evaluations a ray costs in the NeRF paper: 64 by the coarse network, 64 + 128 by the fine one."""
+
+
+def run_bench(options: BenchOptions) -> int:
+    """Measure everything, print tables, write JSON where asked."""
+    if options.json is not None:
+        ensure_writable_folder(Path(options.json).parent)
+    path = runs.octree_path(options.target)
+    threads = options.threads or usable_cores()
+    ops.set_threads(threads)
+    octree, metadata = load_octree(path)
+    orbit = find_orbit(options.target, octree, metadata)
+
+    def cameras(size: int) -> list[Camera]:
+        return orbit_cameras(VIEWS, orbit, (size, size))
+
+    record: dict[str, Any] = {
+        "nerfvol": __version__,
+        "hardware": describe_hardware(),
+        "threads": threads,
+        "octree": {"path": str(path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
+        "file": measure_loading(path, options.repeats),
+        "render": measure_rendering(octree, [cameras(size) for size in options.sizes], threads, options.repeats),
+        "size": measure_sizes(octree, cameras(BASE_SIZE), options.repeats),
+    }
+    if options.reference:
+        record["reference"] = measure_reference(octree, cameras(BASE_SIZE), record)
+    print_tables(record)
+    if options.json is not None:
+        write_json(options.json, record)
+        print(f"figures: {options.json}")
+    return 0
+
+
+def median_seconds(run: Callable[[int], object], repeats: int) -> float:
+    """The median wall-clock time of ``run(0)``, ``run(1)``, ... after one call that is not counted."""
+    run(0)
+    times = []
+    for index in range(repeats):
+        started = time.perf_counter()
+        run(index)
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+def measure_loading(path: Path, repeats: int) -> dict[str, float]:
+    """Bytes of the file and seconds until it can be rendered (from the system's cache)."""
+    return {"bytes": path.stat().st_size, "seconds": median_seconds(lambda _: load_octree(path), min(repeats, 3))}
+
+
+def measure_rendering(
+    octree: Octree, views: Sequence[list[Camera]], threads: int, repeats: int
+) -> list[dict[str, Any]]:
+    """Frames a second at each size, with 1 and all threads, for each build of the kernels."""
+    rows = []
+    in_use = ops.isa()
+    for isa in ops.available_isas():
+        if isa != "reference":
+            ops.set_isa(isa)
+        for count in sorted({1, threads}):
+            ops.set_threads(count)
+            for cameras in views:
+                lens = cameras[0].intrinsics
+                seconds = _frame_seconds(octree, cameras, repeats)
+                rows.append({"isa": isa, "threads": count, "size": lens.width, "frames_per_second": 1.0 / seconds})
+    if in_use != "reference":
+        ops.set_isa(in_use)
+    ops.set_threads(threads)
+    return rows
+
+
+def _frame_seconds(octree: Octree, cameras: Sequence[Camera], repeats: int) -> float:
+    def frame(index: int) -> object:
+        return render_image(octree, cameras[index % len(cameras)], WHITE, DEFAULT_EARLY_STOP, ("rgb",))
+
+    return median_seconds(frame, repeats)
+
+
+def measure_sizes(octree: Octree, cameras: Sequence[Camera], repeats: int) -> list[dict[str, Any]]:
+    """Rendering and training rates of the octree and of coarser versions of it, coarsest first."""
+    rows = []
+    for level in range(max(5, octree.max_level - 4), octree.max_level + 1):
+        tree = octree if level == octree.max_level else coarsened(octree, level)
+        rate, samples = training_rate(tree, cameras, repeats)
+        rows.append(
+            {
+                "level": level,
+                "leaves": tree.n_leaves,
+                "frames_per_second": 1.0 / _frame_seconds(tree, cameras, repeats),
+                "train_rays_per_second": rate,
+                "samples_per_ray": samples,
+            }
+        )
+    return rows
+
+
+def training_rate(octree: Octree, cameras: Sequence[Camera], repeats: int) -> tuple[float, float]:
+    """Rays a second of forward, backward and optimiser on 8x8 tiles, and segments a ray; ``octree`` stays as it is."""
+    batches = [_batch(octree, camera, seed) for seed, camera in enumerate(cameras)]
+    pixel_angle = 1.0 / cameras[0].intrinsics.fx
+    state = ops.TrainState(octree)
+    loss = ops.LossOptions(WHITE, colour=0.03, distortion=0.01)
+    still = ops.Rates(density=0.0, dc=0.0, sh=0.0)
+    samples = []
+
+    def step(index: int) -> None:
+        report = ops.train_step(octree, state, batches[index % len(batches)], loss, still, pixel_angle)
+        samples.append(report.samples)
+
+    seconds = median_seconds(step, repeats)
+    return len(batches[0].rays_d) / seconds, statistics.median(samples)
+
+
+def _batch(octree: Octree, camera: Camera, seed: int) -> ops.Batch:
+    """Random whole tiles of a view that see something, with the octree's own colours, a little off, as the target."""
+    lens = camera.intrinsics
+    image = render_image(octree, camera, WHITE, DEFAULT_EARLY_STOP, ("rgb", "opacity"))
+    tiles = tile_pixels(lens.width, lens.height)
+    seen = (tiles >= 0).all(axis=1) & (image["opacity"].reshape(-1)[np.maximum(tiles, 0)].max(axis=1) > 0.01)
+    candidates = np.flatnonzero(seen) if seen.any() else np.flatnonzero((tiles >= 0).all(axis=1))
+    chosen = tiles[np.sort(np.random.default_rng(seed).choice(candidates, TRAIN_TILES))].reshape(-1)
+    origin, directions = camera.rays()
+    target = np.clip(image["rgb"].reshape(-1, 3)[chosen] * 0.9, 0.0, 1.0)
+    origins = np.broadcast_to(origin, (TRAIN_TILES, 3)).copy()
+    return ops.Batch(origins, directions[chosen], target, np.ones(len(chosen), np.float32))
+
+
+def coarsened(octree: Octree, level: int) -> Octree:
+    """The octree with no leaf finer than ``level``: new vertices take the mean of the leaf they fall in.
+
+    Good enough to measure speed on a scene of the same shape, no level of detail to look at.
+    """
+    shift = np.maximum(octree.leaf_level - level, 0)
+    cells = np.unique(np.column_stack([octree.leaf_level - shift, octree.leaf_ijk >> shift[:, None]]), axis=0)
+    coarse = Octree.from_leaves(
+        cells[:, 0], cells[:, 1:], octree.origin, octree.size, octree.sh_degree, octree.density_scale
+    )
+    leaf = octree.query(np.clip(coarse.vertex_positions(), octree.origin, octree.origin + octree.size * (1 - 1e-9)))
+    inside = leaf >= 0
+    coarse.values[inside] = octree.values[octree.corners[leaf[inside]]].mean(axis=1)
+    coarse.density[~inside] = EMPTY_DENSITY
+    return coarse
+
+
+def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[str, Any]) -> dict[str, Any]:
+    """Rays a second of plain torch on the same octree, and of a network of the paper's size; ratios to the kernels."""
+    import torch
+
+    from nerfvol.fields import Domain, FieldShape, make_field
+    from nerfvol.kernels import reference
+
+    camera = cameras[0]
+    origin, directions = camera.rays()
+    picked = np.random.default_rng(0).choice(len(directions), REFERENCE_RAYS, replace=False)
+    rays_d = torch.from_numpy(directions[picked])
+    rays_o = torch.from_numpy(origin).expand_as(rays_d)
+    values = torch.from_numpy(octree.values)
+
+    def plain(_: int) -> None:
+        with torch.no_grad():
+            reference.render(octree, values, rays_o, rays_d, torch.ones(3), DEFAULT_EARLY_STOP)
+
+    paper = FieldShape(encoding="frequency", width=256, depth=8, skip=5, head="rgb")
+    field = make_field(Domain((0.0, 0.0, 0.0), 1.0), paper)
+    n_rays = 64
+    positions = torch.rand(n_rays * sum(PAPER_SAMPLES), 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    viewdirs = torch.nn.functional.normalize(positions, dim=-1)
+
+    def network(_: int) -> None:
+        with torch.no_grad():
+            field(positions, viewdirs)
+
+    torch_rate = REFERENCE_RAYS / median_seconds(plain, 3)
+    mlp_rate = n_rays / median_seconds(network, 3)
+    kernel_rate = record["size"][-1]["frames_per_second"] * BASE_SIZE**2
+    return {
+        "kernel_rays_per_second": kernel_rate,
+        "torch_rays_per_second": torch_rate,
+        "paper_mlp_rays_per_second": mlp_rate,
+        "kernel_over_torch": kernel_rate / torch_rate,
+        "kernel_over_paper_mlp": kernel_rate / mlp_rate,
+    }
+
+
+def print_tables(record: dict[str, Any]) -> None:
+    """The record as text."""
+    hardware, octree, file = record["hardware"], record["octree"], record["file"]
+    print(f"{hardware['cpu']}, {record['threads']} threads, kernels {hardware['kernel_path']}")
+    megabytes = f"{file['bytes'] / 1e6:.1f} MB"
+    print(f"{octree['path']}: {octree['leaves']:,} leaves, {megabytes}, loads in {file['seconds']:.2f} s\n")
+    sizes = sorted({row["size"] for row in record["render"]})
+    print("frames a second      " + "".join(f"{f'{size}x{size}':>12s}" for size in sizes))
+    for isa, threads in dict.fromkeys((row["isa"], row["threads"]) for row in record["render"]):
+        rates = [r["frames_per_second"] for r in record["render"] if (r["isa"], r["threads"]) == (isa, threads)]
+        plural = "s" if threads > 1 else " "
+        print(f"{isa:10s} {threads:2d} thread{plural} " + "".join(f"{rate:12.2f}" for rate in rates))
+    print(f"\nfinest grid      leaves   frames/s at {BASE_SIZE}²   training rays/s   segments/ray")
+    for row in record["size"]:
+        print(
+            f"{2 ** row['level']:8d}³ {row['leaves']:12,d} {row['frames_per_second']:16.2f} "
+            f"{row['train_rays_per_second']:18,.0f} {row['samples_per_ray']:14.1f}"
+        )
+    if "reference" in record:
+        r = record["reference"]
+        print(
+            f"\nrays a second at {BASE_SIZE}²: kernels {r['kernel_rays_per_second']:,.0f}; plain torch "
+            f"{r['torch_rays_per_second']:,.0f} ({r['kernel_over_torch']:,.0f} times slower); 8x256 network of the "
+            f"NeRF paper {r['paper_mlp_rays_per_second']:,.0f} ({r['kernel_over_paper_mlp']:,.0f} times slower)"
+        )

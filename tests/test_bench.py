@@ -1,0 +1,61 @@
+"""The benchmark measures what it says and leaves the octree alone."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import make_sphere_octree
+
+from nerfvol import bench
+from nerfvol.camera_paths import default_orbit, orbit_cameras
+from nerfvol.octree_io import save_octree
+
+
+@pytest.fixture
+def cameras():
+    return orbit_cameras(2, default_orbit([[-1, -1, -1], [1, 1, 1]]), (64, 64))
+
+
+def test_median_does_not_count_the_first_call(monkeypatch):
+    clock = iter([0.0, 1.0, 10.0, 13.0, 20.0, 22.0])
+    calls = []
+    monkeypatch.setattr(bench.time, "perf_counter", lambda: next(clock))
+    assert bench.median_seconds(calls.append, 3) == 2.0
+    assert calls == [0, 0, 1, 2]
+
+
+def test_coarsened_octree_covers_the_same_leaves():
+    octree = make_sphere_octree(5)
+    coarse = bench.coarsened(octree, 3)
+    coarse.validate()
+    assert coarse.max_level == 3 and coarse.n_leaves < octree.n_leaves
+    assert np.all(coarse.query(octree.leaf_centers()) >= 0)  # nothing lost
+    assert np.all(np.bincount(coarse.query(octree.leaf_centers()), minlength=coarse.n_leaves) > 0)  # nothing added
+    same = bench.coarsened(octree, 9)
+    assert np.array_equal(same.leaf_ijk, octree.leaf_ijk)
+
+
+def test_training_rate_leaves_the_octree_as_it_is(cameras):
+    octree = make_sphere_octree(4)
+    before = octree.values.copy()
+    rate, samples = bench.training_rate(octree, cameras, 2)
+    assert np.array_equal(octree.values, before)
+    assert rate > 0 and 0 < samples < 64
+
+
+def test_bench_command(tmp_path, command, monkeypatch):
+    monkeypatch.setattr(bench, "BASE_SIZE", 48)
+    monkeypatch.setattr(bench, "REFERENCE_RAYS", 64)
+    monkeypatch.setattr(bench, "TRAIN_TILES", 16)
+    save_octree(tmp_path / "o.safetensors", make_sphere_octree(5), {})
+    code, text, _ = command(
+        "bench", tmp_path / "o.safetensors", "--sizes", "16,32", "--repeats", 1, "--threads", 1,
+        "--json", tmp_path / "b.json",
+    )  # fmt: skip
+    assert code == 0 and "frames a second" in text and "training rays/s" in text
+    record = json.loads((tmp_path / "b.json").read_text())
+    assert {row["size"] for row in record["render"]} == {16, 32}
+    assert all(row["frames_per_second"] > 0 for row in record["render"])
+    assert record["size"][-1]["leaves"] == make_sphere_octree(5).n_leaves
+    assert record["reference"]["kernel_over_paper_mlp"] > 0
+    assert record["file"]["bytes"] == (tmp_path / "o.safetensors").stat().st_size
