@@ -1,8 +1,7 @@
 """How data_synth compiles and runs its scalar code.
 
-Every kernel is plain scalar Python that reads like its equation. Numba compiles it once and keeps the machine code in
-``__pycache__``. Numba's cache watches only the file a kernel stands in: after editing a function that a kernel in
-*another* file calls, delete ``data_synth/__pycache__/*.nb*``.
+Everything is plain scalar Python that reads like its equation. ``jit`` marks a function that other compiled code
+calls; ``kernel`` marks an entry point, whose machine code numba keeps in ``__pycache__``.
 
 Kernels release the interpreter lock, so plain threads share the rows of an image between the cores. This compiles
 several times faster than numba's own parallel loops and does not care which threading library torch has loaded.
@@ -13,11 +12,34 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numba
 
 # error_model="numpy": x/0 is inf as in IEEE 754, no exception branch behind every division.
-jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+jit = numba.njit(nogil=True, error_model="numpy")
+
+
+def _sources_stamp() -> tuple[float, int]:
+    """Newest modification time and total size of the package's sources."""
+    stats = [path.stat() for path in Path(__file__).parent.rglob("*.py")]
+    return max(s.st_mtime for s in stats), sum(s.st_size for s in stats)
+
+
+_STAMP = _sources_stamp()
+
+
+def kernel(function: Callable) -> Callable:
+    """Compile an entry point and cache its machine code for as long as no source of the package changes.
+
+    Numba itself compares only the file the function stands in, and would go on using code into which it has inlined
+    a function of another, since edited file.
+    """
+    compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
+    index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if hasattr(index, "_source_stamp"):
+        index._source_stamp = _STAMP
+    return compiled
 
 
 def core_count() -> int:

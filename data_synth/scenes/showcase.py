@@ -15,7 +15,7 @@ import numpy as np
 
 from data_synth.cameras import Camera, Viewpoints, pixel_ray
 from data_synth.image import Picture
-from data_synth.jit import in_bands, jit
+from data_synth.jit import in_bands, jit, kernel
 from data_synth.scenes import showcase_sdf as sdf
 from data_synth.scenes.showcase_sdf import FLOOR
 
@@ -166,17 +166,18 @@ def radiance(haze, ox, oy, oz, dx, dy, dz):
     return r, g, b, 1.0 - trans, far
 
 
-@jit
+@kernel
 def render_rows(haze, camera, out, first, last):
     """Rows first..last of out (H, W, 5), one ray through each pixel's centre."""
     ox, oy, oz = camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3]
     for j in range(first, last):
         for i in range(out.shape[1]):
             dx, dy, dz = pixel_ray(camera, i + 0.5, j + 0.5)
-            out[j, i, :] = radiance(haze, ox, oy, oz, dx, dy, dz)
+            r, g, b, a, f = radiance(haze, ox, oy, oz, dx, dy, dz)
+            out[j, i, 0], out[j, i, 1], out[j, i, 2], out[j, i, 3], out[j, i, 4] = r, g, b, a, f
 
 
-@jit
+@kernel
 def refine_pixels(haze, camera, out, pixels, n, first, last):
     """Replace the pixels (row, column) first..last of the list by the mean of n x n rays on a regular grid."""
     ox, oy, oz = camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3]
@@ -187,7 +188,8 @@ def refine_pixels(haze, camera, out, pixels, n, first, last):
             dx, dy, dz = pixel_ray(camera, i + (s % n + 0.5) / n, j + (s // n + 0.5) / n)
             cr, cg, cb, ca, cf = radiance(haze, ox, oy, oz, dx, dy, dz)
             r, g, b, a, f = r + cr, g + cg, b + cb, a + ca, f + cf
-        out[j, i, :] = r / (n * n), g / (n * n), b / (n * n), a / (n * n), f / (n * n)
+        s = 1.0 / (n * n)
+        out[j, i, 0], out[j, i, 1], out[j, i, 2], out[j, i, 3], out[j, i, 4] = r * s, g * s, b * s, a * s, f * s
 
 
 def edge_pixels(values: np.ndarray, threshold: float) -> np.ndarray:

@@ -1,0 +1,129 @@
+"""The integrators, small objects with ``render(scene, camera, seed) -> Picture``.
+
+| name     | solves                                            | class      |
+|----------|---------------------------------------------------|------------|
+| emission | emission and absorption, no scattering            | Emission   |
+| march    | single scattering, shadow rays                    | March      |
+| deep     | single scattering, deep shadow maps               | DeepShadow |
+| path     | all orders of scattering, Monte Carlo             | Path       |
+| preview  | the look of a cloud [Horizon]: an approximation   | Preview    |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from data_synth import march, path, shadowmap
+from data_synth.cameras import Camera
+from data_synth.errors import InputError
+from data_synth.image import Picture
+from data_synth.jit import in_bands
+from data_synth.scene import Scene
+
+
+@dataclass(frozen=True)
+class March:
+    """Ray-marched single scattering. beams: rays that stand for a sky or area light; side: side^2 rays per pixel."""
+
+    beams: int = 24
+    side: int = 1
+    mode: int = field(default=march.MARCHED, repr=False)
+
+    def _maps(self, scene: Scene, world) -> shadowmap.ShadowMaps:
+        return shadowmap.none()
+
+    def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
+        world, backdrop, maps = _prepared(self, scene)
+        out, data = np.empty((camera.height, camera.width, 5)), camera.data()
+        in_bands(
+            lambda first, last: march.render_rows(
+                world, backdrop, maps, self.mode, data, self.side, scene.opaque_sky, out, first, last
+            ),
+            camera.height,
+            4,
+        )
+        return Picture(out[..., :3], out[..., 3], out[..., 4], samples=self.side**2)
+
+
+@dataclass(frozen=True)
+class Emission(March):
+    """Emission and absorption alone."""
+
+    mode: int = field(default=march.UNLIT, repr=False)
+
+
+@dataclass(frozen=True)
+class Preview(March):
+    """The Horizon-style cloud preview: an approximation that stands next to the answers of the others."""
+
+    mode: int = field(default=march.PREVIEW, repr=False)
+
+
+@dataclass(frozen=True)
+class DeepShadow(March):
+    """Single scattering through deep shadow maps of ``resolution`` samples a side; fill: sweep, eager or lazy."""
+
+    resolution: int = 96
+    fill: str = "sweep"
+    mode: int = field(default=march.MAPPED, repr=False)
+
+    def _maps(self, scene: Scene, world) -> shadowmap.ShadowMaps:
+        return shadowmap.build(world, self.resolution, self.fill)
+
+
+@dataclass(frozen=True)
+class Path:
+    """Volumetric path tracing: ``spp`` paths per pixel of at most ``max_depth`` scattering events (1 = single).
+
+    jitter: paths start anywhere in the pixel (a box filter) instead of at its centre.
+    """
+
+    spp: int = 32
+    max_depth: int = 64
+    jitter: bool = True
+
+    def __post_init__(self) -> None:
+        if self.spp < 1 or self.max_depth < 0:
+            raise InputError(f"--spp: expected at least 1 sample and depth >= 0, got {self.spp} and {self.max_depth}")
+
+    def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
+        world, _, _ = _prepared(self, scene)
+        out, data = np.empty((camera.height, camera.width, 8)), camera.data()
+        settings = path.Settings(self.spp, self.max_depth, self.jitter, scene.opaque_sky, seed)
+        in_bands(
+            lambda first, last: path.render_rows(world, data, settings, out, first, last), camera.height, 2
+        )
+        return Picture(out[..., :3], out[..., 3], out[..., 4], out[..., 5:8], self.spp)
+
+
+INTEGRATORS = {"emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview}
+
+
+def make(name: str, **options):
+    """The integrator called ``name``; options None are left at their defaults."""
+    if name not in INTEGRATORS:
+        raise InputError(f"--integrator: expected one of {', '.join(INTEGRATORS)}, got '{name}'")
+    return INTEGRATORS[name](**{key: value for key, value in options.items() if value is not None})
+
+
+class _Prepared(NamedTuple):
+    world: object
+    backdrop: np.ndarray
+    maps: shadowmap.ShadowMaps
+
+
+def _prepared(integrator, scene: Scene) -> _Prepared:
+    """Arrays and shadow maps of a scene for an integrator, kept on the scene: they do not depend on the camera."""
+    store = scene.__dict__.setdefault("_prepared", {})
+    if integrator not in store:
+        store.clear()
+        if isinstance(integrator, Path):
+            store[integrator] = _Prepared(scene.world(), np.zeros((0, 16)), shadowmap.none())
+        else:
+            world = scene.world(integrator.beams)
+            backdrop = np.array(scene.lights, float).reshape(-1, 16)
+            store[integrator] = _Prepared(world, backdrop, integrator._maps(scene, world))
+    return store[integrator]

@@ -1,0 +1,180 @@
+"""What surfaces do to light (PHYSICS 9). A material table is a (n, 16) float array with rows made below.
+
+Columns: kind, albedo (1-3), second albedo of a checker (4-6), edge of its squares (7, 0 = none), gloss (8), exponent
+(9), index of refraction (10), first and last row in the layer table (11, 12).
+All directions point outward; n is the geometric normal, out of closed shapes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from data_synth import spongecake
+from data_synth.errors import InputError
+from data_synth.jit import jit
+from data_synth.media import rgb
+from data_synth.rng import uniform
+from data_synth.vec import add, cross, dot, from_frame, mul, neg, scale, sphere_direction, sub, unit
+
+LAMBERT, BLINN_PHONG, SPONGECAKE, DIELECTRIC, NULL = range(5)
+
+
+class Materials(NamedTuple):
+    rows: np.ndarray
+    layers: np.ndarray
+
+
+def lambert(albedo, second=None, square: float = 0.0) -> np.ndarray:
+    """Matt; with ``second`` a checker of squares of edge ``square`` (u) in x, y and z."""
+    return _row(LAMBERT, albedo, second, square)
+
+
+def blinn_phong(albedo, gloss: float, exponent: float, second=None, square: float = 0.0) -> np.ndarray:
+    """Matt plus an energy-normalised highlight gloss (e + 8)/(8 pi) (n.h)^e; gloss + albedo should stay below 1."""
+    row = _row(BLINN_PHONG, albedo, second, square)
+    if not 0 <= gloss <= 1 or not exponent >= 0:
+        raise InputError(f"blinn_phong: expected gloss in [0, 1] and exponent >= 0, got {gloss} and {exponent}")
+    row[8], row[9] = gloss, exponent
+    return row
+
+
+def dielectric(ior: float) -> np.ndarray:
+    """A clear, smooth boundary: it reflects and refracts. ior inside over ior outside."""
+    if not ior > 0:
+        raise InputError(f"dielectric: ior must be positive, got {ior}")
+    row = _row(DIELECTRIC, 1.0, None, 0.0)
+    row[10] = ior
+    return row
+
+
+def null() -> np.ndarray:
+    """A boundary that only tells where the medium is: light passes."""
+    return _row(NULL, 1.0, None, 0.0)
+
+
+def layered(first: int, last: int) -> np.ndarray:
+    """SpongeCake layers first..last - 1 of the scene's layer table, top first."""
+    row = _row(SPONGECAKE, 1.0, None, 0.0)
+    row[11], row[12] = first, last
+    return row
+
+
+def _row(kind: int, albedo, second, square: float) -> np.ndarray:
+    row = np.zeros(16)
+    row[0], row[1:4], row[7] = kind, rgb(albedo, "albedo", 1.0), square
+    row[4:7] = row[1:4] if second is None else rgb(second, "second albedo", 1.0)
+    return row
+
+
+@jit
+def albedo_at(row, p):
+    if row[7] > 0.0:
+        e = 1.0 / row[7]
+        odd = math.floor(p[0] * e + 1e-6) + math.floor(p[1] * e + 1e-6) + math.floor(p[2] * e + 1e-6)
+        if odd % 2.0 != 0.0:
+            return (row[4], row[5], row[6])
+    return (row[1], row[2], row[3])
+
+
+@jit
+def to_local(n, w):
+    s, t = spongecake_frame(n)
+    return (dot(w, s), dot(w, t), dot(w, n))
+
+
+@jit
+def spongecake_frame(n):
+    """A tangent frame whose first axis is as near to x as can be, so that fibres lie the same way all over a sheet."""
+    reference = (1.0, 0.0, 0.0) if abs(n[0]) < 0.9 else (0.0, 1.0, 0.0)
+    t = unit(cross(n, reference))
+    return cross(t, n), t
+
+
+@jit
+def evaluate(m, k, p, n, wo, wi):
+    """RGB f(wo, wi) |cos wi|; 0 for the deltas (dielectric, null, straight on)."""
+    row = m.rows[k]
+    if row[0] == SPONGECAKE:
+        f = spongecake.evaluate(m.layers, int(row[11]), int(row[12]), to_local(n, wo), to_local(n, wi))
+        return scale(abs(dot(n, wi)), f)
+    out, cosine = dot(n, wo), dot(n, wi)
+    if row[0] >= DIELECTRIC or out * cosine <= 0.0:
+        return (0.0, 0.0, 0.0)
+    f = scale(abs(cosine) / math.pi, albedo_at(row, p))
+    if row[0] == BLINN_PHONG:
+        h = unit(add(wo, wi))
+        lobe = row[8] * (row[9] + 8.0) / (8.0 * math.pi) * abs(dot(n, h)) ** row[9] * abs(cosine)
+        f = (f[0] + lobe, f[1] + lobe, f[2] + lobe)
+    return f
+
+
+@jit
+def pdf(m, k, n, wo, wi):
+    """Density of ``sample`` (1/sr) for its scattered, not straight, directions."""
+    row = m.rows[k]
+    if row[0] == SPONGECAKE:
+        return spongecake.pdf(m.layers, int(row[11]), int(row[12]), to_local(n, wo), to_local(n, wi))
+    out, cosine = dot(n, wo), dot(n, wi)
+    if row[0] >= DIELECTRIC or out * cosine <= 0.0:
+        return 0.0
+    density = abs(cosine) / math.pi
+    if row[0] == BLINN_PHONG:
+        h = unit(add(wo, wi))
+        lobe = (row[9] + 1.0) / (2.0 * math.pi) * abs(dot(n, h)) ** row[9] / (4.0 * max(abs(dot(wo, h)), 1e-9))
+        density += 0.5 * (lobe - density)
+    return density
+
+
+@jit
+def refract(n, wo, ior, rng):
+    """Mirror or refract at a smooth boundary, by chance of the Fresnel reflectance. (wi, crossed)."""
+    cosine = dot(n, wo)
+    eta = 1.0 / ior if cosine > 0.0 else ior
+    s2 = eta * eta * (1.0 - cosine * cosine)
+    ci = abs(cosine)
+    fresnel = 1.0
+    if s2 < 1.0:
+        ct = math.sqrt(1.0 - s2)
+        parallel = (ci - eta * ct) / (ci + eta * ct)
+        across = (eta * ci - ct) / (eta * ci + ct)
+        fresnel = 0.5 * (parallel * parallel + across * across)
+    if uniform(rng) < fresnel:
+        return sub(scale(2.0 * cosine, n), wo), False
+    side = 1.0 if cosine > 0.0 else -1.0
+    return unit(sub(scale(eta * ci - math.sqrt(1.0 - s2), scale(side, n)), scale(eta, wo))), True
+
+
+@jit
+def sample(m, k, p, n, wo, rng):
+    """(wi, weight, pdf, crossed): weight = f |cos| / pdf; pdf 0 marks a delta; crossed: through a medium boundary.
+
+    Radiance is not scaled by the squared index on refraction: it is scaled back when the path leaves again.
+    """
+    row = m.rows[k]
+    one = (1.0, 1.0, 1.0)
+    if row[0] == NULL:
+        return neg(wo), one, 0.0, True
+    if row[0] == DIELECTRIC:
+        wi, crossed = refract(n, wo, row[10], rng)
+        return wi, one, 0.0, crossed
+    if row[0] == SPONGECAKE:
+        local, straight = spongecake.sample(m.layers, int(row[11]), int(row[12]), to_local(n, wo), rng)
+        if straight:
+            return neg(wo), one, 0.0, False
+        s, t = spongecake_frame(n)
+        wi = add(add(scale(local[0], s), scale(local[1], t)), scale(local[2], n))
+    else:
+        up = n if dot(n, wo) > 0.0 else neg(n)
+        if row[0] == BLINN_PHONG and uniform(rng) < 0.5:
+            h = sphere_direction(up, uniform(rng) ** (1.0 / (row[9] + 1.0)), 2.0 * math.pi * uniform(rng))
+            wi = unit(sub(scale(2.0 * dot(wo, h), h), wo))
+        else:
+            r, a = math.sqrt(uniform(rng)), 2.0 * math.pi * uniform(rng)
+            wi = from_frame(up, r * math.cos(a), r * math.sin(a), math.sqrt(max(1.0 - r * r, 0.0)))
+    density = pdf(m, k, n, wo, wi)
+    if density <= 0.0:
+        return wi, (0.0, 0.0, 0.0), 1.0, False
+    return wi, mul(evaluate(m, k, p, n, wo, wi), (1.0 / density, 1.0 / density, 1.0 / density)), density, False

@@ -1,0 +1,251 @@
+"""Participating media (PHYSICS 5): where the coefficients are, and how a kernel looks them up.
+
+A medium has a dimensionless density rho(x) >= 0, constant RGB extinction per density sigma_t in 1/u, and RGB albedo and
+emitted radiance Le that may depend on a second field, the *attribute* in [0, 1] (a temperature, a tissue, a thread):
+    sigma_t(x) = sigma_t rho(x),  sigma_s = albedo sigma_t,  sigma_a = sigma_t - sigma_s,  emission = sigma_a Le.
+Microflakes multiply the extinction by their projected area towards the ray.
+
+Density grids hold samples at the *vertices* of cubic cells, trilinear in between. They are stored sparsely in bricks of
+8^3 cells with their 9^3 samples, so that a lookup reads one brick; a brick without density is not stored. Every brick
+knows the largest and smallest of its samples: exact bounds of the trilinear density, local majorants for free.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from data_synth import phase as phases
+from data_synth.errors import InputError
+from data_synth.jit import jit
+from data_synth.sggx import projected_area
+
+BRICK = 8
+HOMOGENEOUS, GRID, EXPONENTIAL = range(3)
+
+
+class Medium(NamedTuple):
+    """A medium inside the box lo..hi, as plain numbers for the kernels. Make it with the functions below.
+
+    bricks: bricks per axis; brick_size: their edges in u; cell: edges of a cell in u; offsets: (bricks,) first sample
+    of a brick or -1; samples, attributes: float32; brick_max, brick_min: (bricks,) bounds of the density; sigma_t: RGB
+    per density; albedo, Le: (K, 3) tables over the attribute; base, falloff: of the exponential; step: length of a
+    marching step in u; flake_area: largest projected area of the microflakes (1 without).
+    """
+
+    kind: int
+    lo: tuple[float, float, float]
+    hi: tuple[float, float, float]
+    cells: tuple[int, int, int]
+    bricks: tuple[int, int, int]
+    cell: tuple[float, float, float]
+    offsets: np.ndarray
+    samples: np.ndarray
+    attributes: np.ndarray
+    brick_max: np.ndarray
+    brick_min: np.ndarray
+    max_density: float
+    sigma_t: tuple[float, float, float]
+    albedo: np.ndarray
+    Le: np.ndarray
+    base: float
+    falloff: float
+    step: float
+    flake_area: float
+    phase: phases.Phase
+
+
+def rgb(value, name: str, upper: float = math.inf) -> tuple[float, float, float]:
+    """A grey number or three numbers as an RGB tuple, finite and in [0, upper]."""
+    a = np.broadcast_to(np.asarray(value, dtype=np.float64), (3,)) if np.ndim(value) < 2 else None
+    if a is None or not np.isfinite(a).all() or a.min() < 0 or a.max() > upper:
+        limit = "finite and not negative" if upper == math.inf else f"in [0, {upper:g}]"
+        raise InputError(f"{name}: expected one or three numbers {limit}, got {value}")
+    return tuple(float(v) for v in a)
+
+
+def _table(value, name: str, upper: float = math.inf) -> np.ndarray:
+    rows = value if np.ndim(value) == 2 else [value]
+    return np.array([rgb(row, name, upper) for row in rows])
+
+
+def homogeneous(lo, hi, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None) -> Medium:
+    """Density 1 inside the box lo..hi. sigma_t in 1/u."""
+    one = np.ones(1)
+    return _medium(HOMOGENEOUS, lo, hi, (1, 1, 1), (one, one), sigma_t, albedo, Le, phase)
+
+
+def exponential(lo, hi, height: float, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None) -> Medium:
+    """Density exp(-(z - lo_z) / height): fog and atmospheres, with a closed-form optical thickness. height in u."""
+    if not (math.isfinite(height) and height > 0):
+        raise InputError(f"exponential: height must be positive, got {height}")
+    layers = 16
+    edge = np.exp(-np.linspace(0, hi[2] - lo[2], layers + 1) / height)
+    medium = _medium(EXPONENTIAL, lo, hi, (1, 1, layers), (edge[:-1], edge[1:]), sigma_t, albedo, Le, phase)
+    return medium._replace(base=float(lo[2]), falloff=1.0 / height)
+
+
+def grid(density, lo, hi, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None, attribute=None, majorant=None) -> Medium:
+    """A heterogeneous medium of (nx, ny, nz) density samples at the vertices of a regular grid from lo to hi.
+
+    attribute: same shape, in [0, 1]. majorant: an upper bound the caller believes in; lower is an error.
+    """
+    density = np.asarray(density)
+    if density.ndim != 3 or min(density.shape) < 2:
+        raise InputError(f"medium: density must be a 3D array of at least 2 samples a side, got shape {density.shape}")
+    if not np.isfinite(density).all() or density.min() < 0:
+        raise InputError("medium: density must be finite and not negative, got a negative, infinite or NaN sample")
+    if majorant is not None and majorant < density.max():
+        raise InputError(f"medium: majorant {majorant:g} lies below the largest density {density.max():g}")
+    if attribute is not None and np.shape(attribute) != density.shape:
+        raise InputError(f"medium: attribute must have the density's shape {density.shape}, got {np.shape(attribute)}")
+    stored = _bricks(density.astype(np.float32), attribute)
+    cells = tuple(n - 1 for n in density.shape)
+    medium = _medium(GRID, lo, hi, cells, stored[:2], sigma_t, albedo, Le, phase)
+    return medium._replace(offsets=stored[2], samples=stored[3], attributes=stored[4])
+
+
+def from_function(function: Callable, lo, hi, resolution: int = 128, **coefficients) -> Medium:
+    """A grid sampled from ``function(x, y, z)`` of broadcast arrays, ``resolution`` samples along the longest side."""
+    lo, hi = np.asarray(lo, float), np.asarray(hi, float)
+    spacing = (hi - lo).max() / (resolution - 1)
+    shape = np.maximum(np.rint((hi - lo) / spacing).astype(int) + 1, 2)
+    axes = [np.linspace(lo[k], hi[k], shape[k]) for k in range(3)]
+    density = np.broadcast_to(function(*np.meshgrid(*axes, indexing="ij", sparse=True)), shape)
+    return grid(density, lo, hi, **coefficients)
+
+
+def _bricks(density: np.ndarray, attribute) -> tuple:
+    cells = np.array(density.shape) - 1
+    counts = -(-cells // BRICK)
+    padding = [(0, int(n * BRICK - c)) for n, c in zip(counts, cells, strict=True)]
+
+    def cut(a: np.ndarray) -> np.ndarray:  # (bricks, 9, 9, 9) overlapping windows
+        windows = np.lib.stride_tricks.sliding_window_view(np.pad(a, padding), (BRICK + 1,) * 3)
+        return windows[::BRICK, ::BRICK, ::BRICK].reshape(-1, (BRICK + 1) ** 3)
+
+    blocks = cut(density)
+    top, bottom = blocks.max(axis=1), blocks.min(axis=1)
+    kept = np.flatnonzero(top > 0)
+    offsets = np.full(len(blocks), -1, dtype=np.int64)
+    offsets[kept] = np.arange(len(kept)) * (BRICK + 1) ** 3
+    attributes = np.zeros(1, np.float32)
+    if attribute is not None:
+        attributes = np.ascontiguousarray(cut(np.asarray(attribute, np.float32))[kept]).ravel()
+    samples = np.ascontiguousarray(blocks[kept]).ravel()
+    return top.astype(float), bottom.astype(float), offsets, samples, attributes
+
+
+def _medium(kind, lo, hi, cells, bounds, sigma_t, albedo, Le, phase) -> Medium:
+    lo, hi = tuple(map(float, lo)), tuple(map(float, hi))
+    if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lo, hi, strict=True)):
+        raise InputError(f"medium: expected a box with lo < hi, got {lo} and {hi}")
+    phase = phase or phases.isotropic()
+    area = math.sqrt(max(np.linalg.eigvalsh(_matrix(s))[-1] for s in phase.S))
+    cell = tuple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
+    step = 0.5 * min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
+    return Medium(
+        kind, lo, hi, cells, tuple(-(-n // BRICK) for n in cells) if kind == GRID else cells, cell,
+        np.zeros(1, np.int64), np.zeros(1, np.float32), np.zeros(1, np.float32),
+        np.ascontiguousarray(bounds[0], dtype=float), np.ascontiguousarray(bounds[1], dtype=float),
+        float(np.max(bounds[0], initial=0.0)), rgb(sigma_t, "sigma_t"), _table(albedo, "albedo", 1.0),
+        _table(Le, "Le"), 0.0, 0.0, step, area, phase,
+    )  # fmt: skip
+
+
+def _matrix(s) -> np.ndarray:
+    return np.array([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
+
+
+def dense(m: Medium) -> np.ndarray:
+    """The (nx, ny, nz) float32 density samples of a grid medium, the truth to compare a reconstruction with."""
+    out = np.zeros([n * BRICK + 1 for n in m.bricks], np.float32)
+    for index, offset in enumerate(m.offsets):
+        if offset >= 0:
+            i, j, k = (BRICK * v for v in np.unravel_index(index, m.bricks))
+            block = m.samples[offset : offset + (BRICK + 1) ** 3].reshape((BRICK + 1,) * 3)
+            out[i : i + BRICK + 1, j : j + BRICK + 1, k : k + BRICK + 1] = block
+    return out[: m.cells[0] + 1, : m.cells[1] + 1, : m.cells[2] + 1]
+
+
+@jit
+def trilinear(m, values, p):
+    """Interpolate brick samples ``values`` at p, 0 outside the stored bricks."""
+    n = m.cells
+    u = (p[0] - m.lo[0]) / m.cell[0]
+    v = (p[1] - m.lo[1]) / m.cell[1]
+    w = (p[2] - m.lo[2]) / m.cell[2]
+    i = min(max(int(u), 0), n[0] - 1)
+    j = min(max(int(v), 0), n[1] - 1)
+    k = min(max(int(w), 0), n[2] - 1)
+    first = m.offsets[((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3)]
+    if first < 0:
+        return 0.0
+    fu, fv, fw = u - i, v - j, w - k
+    a = first + ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
+    b = a + 81
+    low = (values[a] * (1.0 - fw) + values[a + 1] * fw) * (1.0 - fv) + (
+        values[a + 9] * (1.0 - fw) + values[a + 10] * fw
+    ) * fv
+    high = (values[b] * (1.0 - fw) + values[b + 1] * fw) * (1.0 - fv) + (
+        values[b + 9] * (1.0 - fw) + values[b + 10] * fw
+    ) * fv
+    return low * (1.0 - fu) + high * fu
+
+
+@jit
+def density(m, p):
+    """rho at a point inside the box."""
+    if m.kind == GRID:
+        return trilinear(m, m.samples, p)
+    if m.kind == EXPONENTIAL:
+        return math.exp(-(p[2] - m.base) * m.falloff)
+    return 1.0
+
+
+@jit
+def attribute(m, p):
+    """The attribute at a point, 0 for media that have none."""
+    return trilinear(m, m.attributes, p) if m.attributes.size > 1 else 0.0
+
+
+@jit
+def extinction(m, p, d):
+    """rho at p, times the projected area of microflakes towards d: sigma_t(x, d) / sigma_t."""
+    rho = density(m, p)
+    if m.phase.kind >= phases.SGGX_SPECULAR and rho > 0.0:
+        rho *= projected_area(phases.flakes_at(m.phase, attribute(m, p)), d)
+    return rho
+
+
+@jit
+def lookup(table, a):
+    """Row of a (K, 3) table at a in [0, 1], linear in between."""
+    n = table.shape[0]
+    if n == 1:
+        return (table[0, 0], table[0, 1], table[0, 2])
+    x = min(max(a, 0.0), 1.0) * (n - 1)
+    i = min(int(x), n - 2)
+    f = x - i
+    return (
+        table[i, 0] + f * (table[i + 1, 0] - table[i, 0]),
+        table[i, 1] + f * (table[i + 1, 1] - table[i, 1]),
+        table[i, 2] + f * (table[i + 1, 2] - table[i, 2]),
+    )
+
+
+@jit
+def box_interval(ray, lo, hi):
+    """(t0, t1) of a ray inside a box with t0 >= 0; t0 > t1 if it misses."""
+    t0, t1 = 0.0, math.inf
+    for axis in range(3):
+        if ray[1][axis] == 0.0:
+            if ray[0][axis] < lo[axis] or ray[0][axis] > hi[axis]:
+                return 1.0, 0.0
+        else:
+            a, b = (lo[axis] - ray[0][axis]) / ray[1][axis], (hi[axis] - ray[0][axis]) / ray[1][axis]
+            t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
+    return t0, t1

@@ -1,0 +1,134 @@
+"""Phase functions, all normalised to integrate to 1 over the sphere (PHYSICS 6).
+
+wo and wi point outward from the scattering point: light arrives along -wi and leaves along wo, or the other way round.
+The angle theta is between the *propagation* directions before and after, so cos(theta) = -wo.wi and g > 0 is forward.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from data_synth import sggx
+from data_synth.errors import InputError
+from data_synth.jit import jit
+from data_synth.rng import uniform
+from data_synth.vec import dot, neg, sphere_direction
+
+ISOTROPIC, RAYLEIGH, HG, SGGX_SPECULAR, SGGX_DIFFUSE = range(5)
+
+
+class Phase(NamedTuple):
+    """A phase function. Make it with the functions below.
+
+    g1, g2: mean cosines of the two Henyey-Greenstein lobes; mix: weight of the first. S: (K, 6) SGGX matrices, one per
+    value of the medium's attribute.
+    """
+
+    kind: int
+    g1: float
+    g2: float
+    mix: float
+    S: np.ndarray
+
+
+_NO_FLAKES = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
+
+
+def isotropic() -> Phase:
+    """1 / 4 pi."""
+    return Phase(ISOTROPIC, 0.0, 0.0, 1.0, _NO_FLAKES)
+
+
+def rayleigh() -> Phase:
+    """3/(16 pi) (1 + cos^2 theta): particles much smaller than the wavelength."""
+    return Phase(RAYLEIGH, 0.0, 0.0, 1.0, _NO_FLAKES)
+
+
+def henyey_greenstein(g: float) -> Phase:
+    """[HG] (1 - g^2) / (4 pi (1 + g^2 - 2 g cos theta)^(3/2)), mean cosine g in (-1, 1)."""
+    return two_lobes(g, g, 1.0)
+
+
+def two_lobes(g1: float, g2: float, mix: float) -> Phase:
+    """mix HG(g1) + (1 - mix) HG(g2): clouds are near g1 = 0.8, g2 = -0.3, mix = 0.7."""
+    for name, g in (("g1", g1), ("g2", g2)):
+        if not (math.isfinite(g) and abs(g) < 1):
+            raise InputError(f"phase: {name} must be in (-1, 1), got {g}")
+    if not 0 <= mix <= 1:
+        raise InputError(f"phase: mix must be in [0, 1], got {mix}")
+    return Phase(HG, float(g1), float(g2), float(mix), _NO_FLAKES)
+
+
+def microflakes(*S, diffuse: bool = False) -> Phase:
+    """SGGX microflakes, specular by default. S: one or more 3x3 matrices or rows of six numbers (``sggx.fibre``)."""
+    rows = []
+    for s in S:
+        s = np.asarray(s, dtype=np.float64)
+        rows.append(sggx.check_sggx(s if s.shape == (3, 3) else s[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)))
+    return Phase(SGGX_DIFFUSE if diffuse else SGGX_SPECULAR, 0.0, 0.0, 1.0, np.stack(rows))
+
+
+@jit
+def flakes_at(phase, attribute):
+    """The six numbers of S for an attribute in [0, 1]: the nearest row."""
+    n = phase.S.shape[0]
+    k = min(max(int(attribute * (n - 1) + 0.5), 0), n - 1)
+    S = phase.S
+    return (S[k, 0], S[k, 1], S[k, 2], S[k, 3], S[k, 4], S[k, 5])
+
+
+@jit
+def hg(g, cosine):
+    q = 1.0 + g * g - 2.0 * g * cosine
+    return (1.0 - g * g) / (4.0 * math.pi * q * math.sqrt(q))
+
+
+@jit
+def hg_cosine(g, u):
+    """cos(theta) distributed as HG for u uniform.
+
+    The inverse CDF (1 + g^2 - s^2) / 2g with s = (1 - g^2) / (1 - g + 2 g u), multiplied out in v = 2u - 1 so that
+    nothing is divided by g: exact down to g = 0, where it is v.
+    """
+    v = 2.0 * u - 1.0
+    q = 1.0 + g * v
+    return (2.0 * v * (1.0 + g * g) + g * (3.0 - g * g) + g * (1.0 + g * g) * v * v) / (2.0 * q * q)
+
+
+@jit
+def evaluate(phase, attribute, wo, wi, rng):
+    """f_p(wo, wi) in 1/sr. The diffuse flakes alone need random numbers; their value is right on average."""
+    cosine = -dot(wo, wi)
+    if phase.kind == HG:
+        f = phase.mix * hg(phase.g1, cosine)
+        return f + (1.0 - phase.mix) * hg(phase.g2, cosine) if phase.mix < 1.0 else f
+    if phase.kind == RAYLEIGH:
+        return 3.0 / (16.0 * math.pi) * (1.0 + cosine * cosine)
+    if phase.kind == SGGX_SPECULAR:
+        return sggx.eval_specular(flakes_at(phase, attribute), wo, wi)
+    if phase.kind == SGGX_DIFFUSE:
+        return sggx.eval_diffuse(flakes_at(phase, attribute), wo, wi, rng)
+    return 0.25 / math.pi
+
+
+@jit
+def sample(phase, attribute, wo, rng):
+    """wi with density f_p(wo, .): every phase function here is sampled exactly."""
+    if phase.kind == SGGX_SPECULAR:
+        return sggx.sample_specular(flakes_at(phase, attribute), wo, rng)
+    if phase.kind == SGGX_DIFFUSE:
+        return sggx.sample_diffuse(flakes_at(phase, attribute), wo, rng)
+    u = uniform(rng)
+    if phase.kind == HG:
+        cosine = hg_cosine(phase.g1 if uniform(rng) < phase.mix else phase.g2, u)
+    elif phase.kind == RAYLEIGH:  # Cardano's root of (cosine^3 + 3 cosine + 4) / 8 = u
+        a = 4.0 * u - 2.0
+        b = math.sqrt(a * a + 1.0)
+        root = (a + b) ** (1.0 / 3.0)
+        cosine = root - 1.0 / root
+    else:
+        cosine = 2.0 * u - 1.0
+    return sphere_direction(neg(wo), cosine, 2.0 * math.pi * uniform(rng))

@@ -1,0 +1,134 @@
+"""The SGGX distribution of microflakes [Heitz, Dupuy, Crassin & Dachsbacher 2015], PHYSICS 11.
+
+S is a symmetric positive definite 3x3 matrix, stored as the tuple (xx, yy, zz, xy, xz, yz).
+    projected area   sigma(w) = sqrt(w' S w)
+    normals          D(m) = 1 / (pi sqrt|S| (m' S^-1 m)^2)
+    visible normals  D_w(m) = max(w.m, 0) D(m) / sigma(w)
+    specular phase   f_p(wo -> wi) = D(h) / (4 sigma(wo)),  h = (wo + wi) / |wo + wi|
+    diffuse phase    f_p(wo -> wi) = 1/pi  integral of max(wi.m, 0) D_wo(m) dm
+All directions point outward, away from the point.
+"""
+
+import math
+
+import numpy as np
+
+from data_synth.errors import InputError
+from data_synth.jit import jit
+from data_synth.rng import uniform
+from data_synth.vec import add, dot, frame, scale, sphere_direction, sub, unit
+
+
+def fibre(axis, roughness: float) -> np.ndarray:
+    """S of fibres along ``axis``: R diag(1, 1, roughness^2) R' as six numbers."""
+    return _about(axis, 1.0, roughness * roughness, roughness)
+
+
+def surface(normal, roughness: float) -> np.ndarray:
+    """S of flakes that face ``normal``: R diag(roughness^2, roughness^2, 1) R' as six numbers."""
+    return _about(normal, roughness * roughness, 1.0, roughness)
+
+
+def _about(axis, across: float, along: float, roughness: float) -> np.ndarray:
+    if not 0.0 < roughness <= 1.0:
+        raise InputError(f"SGGX: roughness must be in (0, 1], got {roughness}")
+    a = np.asarray(axis, dtype=np.float64)
+    a = a / np.linalg.norm(a)
+    return check_sggx(across * np.eye(3) + (along - across) * np.outer(a, a))
+
+
+def check_sggx(matrix) -> np.ndarray:
+    """The six numbers of a symmetric positive definite 3x3 matrix; anything else is an error."""
+    s = np.asarray(matrix, dtype=np.float64)
+    if s.shape != (3, 3) or not np.isfinite(s).all() or np.abs(s - s.T).max() > 1e-9:
+        raise InputError("SGGX: S must be a finite symmetric 3x3 matrix")
+    if np.linalg.eigvalsh(s)[0] <= 0:
+        raise InputError(f"SGGX: S must be positive definite, got smallest eigenvalue {np.linalg.eigvalsh(s)[0]:.3g}")
+    return np.array([s[0, 0], s[1, 1], s[2, 2], s[0, 1], s[0, 2], s[1, 2]])
+
+
+@jit
+def times(s, w):
+    """S w."""
+    return (
+        s[0] * w[0] + s[3] * w[1] + s[4] * w[2],
+        s[3] * w[0] + s[1] * w[1] + s[5] * w[2],
+        s[4] * w[0] + s[5] * w[1] + s[2] * w[2],
+    )
+
+
+@jit
+def projected_area(s, w):
+    return math.sqrt(dot(w, times(s, w)))
+
+
+@jit
+def determinant(s):
+    return (
+        s[0] * s[1] * s[2] + 2.0 * s[3] * s[4] * s[5] - s[0] * s[5] * s[5] - s[1] * s[4] * s[4] - s[2] * s[3] * s[3]
+    )
+
+
+@jit
+def normal_density(s, m):
+    """D(m). m' S^-1 m is written with the adjugate of S."""
+    adjugate = (
+        s[1] * s[2] - s[5] * s[5],
+        s[0] * s[2] - s[4] * s[4],
+        s[0] * s[1] - s[3] * s[3],
+        s[4] * s[5] - s[3] * s[2],
+        s[3] * s[5] - s[4] * s[1],
+        s[3] * s[4] - s[5] * s[0],
+    )
+    det = determinant(s)
+    q = dot(m, times(adjugate, m)) / det
+    return 1.0 / (math.pi * math.sqrt(det) * q * q)
+
+
+@jit
+def sample_visible_normal(s, w, rng):
+    """A normal m distributed as D_w(m): the three-vector construction of the paper's section 4.3 in the frame of w."""
+    k, j = frame(w)
+    sk, sj, si = times(s, k), times(s, j), times(s, w)
+    skk, sjj, sii = dot(k, sk), dot(j, sj), dot(w, si)
+    skj, ski, sji = dot(k, sj), dot(k, si), dot(j, si)
+    det = math.sqrt(abs(skk * (sjj * sii - sji * sji) - skj * (skj * sii - sji * ski) + ski * (skj * sji - sjj * ski)))
+    inv_sii, tmp = 1.0 / math.sqrt(sii), math.sqrt(max(sjj * sii - sji * sji, 0.0))
+    # a uniform point of the visible half of the unit sphere, seen from above
+    r, a = math.sqrt(uniform(rng)), 2.0 * math.pi * uniform(rng)
+    u, v = r * math.cos(a), r * math.sin(a)
+    n = math.sqrt(max(1.0 - u * u - v * v, 0.0))
+    # M_k u + M_j v + M_i n with the columns of the square root of S in the frame (k, j, w)
+    mk = u * det / tmp - v * inv_sii * (ski * sji - skj * sii) / tmp + n * inv_sii * ski
+    mj = v * inv_sii * tmp + n * inv_sii * sji
+    mi = n * inv_sii * sii
+    return unit(add(add(scale(mk, k), scale(mj, j)), scale(mi, w)))
+
+
+@jit
+def eval_specular(s, wo, wi):
+    h = add(wo, wi)
+    length = math.sqrt(dot(h, h))
+    if length < 1e-12:  # exactly forward: the half vector is any normal across the ray, never sampled
+        return 0.0
+    return normal_density(s, scale(1.0 / length, h)) / (4.0 * projected_area(s, wo))
+
+
+@jit
+def sample_specular(s, wo, rng):
+    """wi with density f_p: mirror wo at a visible normal."""
+    m = sample_visible_normal(s, wo, rng)
+    return unit(sub(scale(2.0 * dot(wo, m), m), wo))
+
+
+@jit
+def eval_diffuse(s, wo, wi, rng):
+    """One unbiased sample of the diffuse phase function: the integral has no closed form."""
+    return max(dot(wi, sample_visible_normal(s, wo, rng)), 0.0) / math.pi
+
+
+@jit
+def sample_diffuse(s, wo, rng):
+    """wi with density f_p: cosine-distributed about a visible normal."""
+    m = sample_visible_normal(s, wo, rng)
+    return sphere_direction(m, math.sqrt(1.0 - uniform(rng)), 2.0 * math.pi * uniform(rng))

@@ -1,0 +1,215 @@
+"""Surfaces: planes, spheres, boxes and triangles, and the materials on them (PHYSICS 9).
+
+A shape table is a (n, 12) float array: kind, material, numbers. Triangles stand in a second table, (m, 12):
+material, corner, edge, edge, and are found through a bounding volume hierarchy. A hit's normal points *out* of closed
+shapes, on the side of edge x edge for triangles.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from data_synth.errors import InputError
+from data_synth.jit import jit
+from data_synth.vec import along, cross, dot, sub, unit
+
+PLANE, SPHERE, BOX = range(3)
+EPSILON = 1e-6  # hits nearer than this (in u) are the surface a ray starts on
+LEAF = 4
+
+
+class Geometry(NamedTuple):
+    """All surfaces. bvh: (nodes, 8) lo, hi, second child or first triangle, number of triangles (0 inside)."""
+
+    shapes: np.ndarray
+    triangles: np.ndarray
+    bvh: np.ndarray
+
+
+def plane(material: int, point, normal) -> np.ndarray:
+    """An infinite plane."""
+    normal = np.asarray(normal, float)
+    return _shape(PLANE, material, point, normal / np.linalg.norm(normal))
+
+
+def sphere(material: int, centre, radius: float) -> np.ndarray:
+    if not radius > 0:
+        raise InputError(f"sphere: radius must be positive, got {radius}")
+    return _shape(SPHERE, material, centre, [radius])
+
+
+def box(material: int, lo, hi) -> np.ndarray:
+    """An axis-aligned box."""
+    return _shape(BOX, material, lo, hi)
+
+
+def mesh(material: int, vertices, faces) -> np.ndarray:
+    """(m, 12) rows of triangles from (n, 3) vertices and (m, 3) vertex numbers."""
+    vertices, faces = np.asarray(vertices, float), np.asarray(faces)
+    if not np.isfinite(vertices).all() or faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise InputError("mesh: expected finite vertices and faces that number them")
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    rows = np.zeros((len(faces), 12))
+    rows[:, 0], rows[:, 1:4], rows[:, 4:7], rows[:, 7:10] = material, a, b - a, c - a
+    return rows
+
+
+def _shape(kind: int, material: int, *columns) -> np.ndarray:
+    row = np.zeros(12)
+    values = np.concatenate([np.ravel(np.asarray(c, float)) for c in columns])
+    if not np.isfinite(values).all():
+        raise InputError("shape: expected finite numbers")
+    row[0], row[1], row[2 : 2 + len(values)] = kind, material, values
+    return row
+
+
+def geometry(shapes=(), triangles=None) -> Geometry:
+    """Collect shapes, and triangles in a hierarchy (median split along the longest side)."""
+    table = np.array(shapes, float).reshape(-1, 12)
+    if triangles is None or len(triangles) == 0:
+        return Geometry(table, np.zeros((0, 12)), np.zeros((0, 8)))
+    corners = triangles[:, None, 1:4] + np.stack(
+        [np.zeros_like(triangles[:, 1:4]), triangles[:, 4:7], triangles[:, 7:10]], axis=1
+    )
+    lo, hi = corners.min(axis=1), corners.max(axis=1)
+    order, nodes = np.arange(len(triangles)), []
+
+    def build(first: int, last: int) -> int:
+        part = order[first:last]
+        index = len(nodes)
+        low, high = lo[part].min(axis=0), hi[part].max(axis=0)
+        nodes.append([*low, *high, first, last - first])
+        if last - first > LEAF:
+            axis = int(np.argmax(high - low))
+            middle = (last - first) // 2
+            order[first:last] = part[np.argsort((lo + hi)[part, axis], kind="stable")]
+            build(first, first + middle)  # the first child follows its parent
+            nodes[index][6:] = [build(first + middle, last), 0]
+        return index
+
+    build(0, len(order))
+    return Geometry(table, np.ascontiguousarray(triangles[order]), np.array(nodes, float))
+
+
+@jit
+def sphere_roots(ray, centre, radius):
+    """(t0, t1) of a ray and a sphere, t0 > t1 if it misses."""
+    to = sub(centre, ray[0])
+    b = dot(to, ray[1])
+    off = (to[0] - b * ray[1][0], to[1] - b * ray[1][1], to[2] - b * ray[1][2])
+    h = radius * radius - dot(off, off)
+    if h < 0.0:
+        return 1.0, 0.0
+    h = math.sqrt(h)
+    return b - h, b + h
+
+
+@jit
+def box_roots(ray, lo, hi):
+    """(t0, t1) of a ray and a box, t0 > t1 if it misses; t0 may be negative."""
+    t0, t1 = -math.inf, math.inf
+    for axis in range(3):
+        inverse = 1.0 / ray[1][axis]
+        a, b = (lo[axis] - ray[0][axis]) * inverse, (hi[axis] - ray[0][axis]) * inverse
+        t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
+    return t0, t1
+
+
+@jit
+def hit_shape(row, ray, t_max):
+    """Nearest t in (EPSILON, t_max) of a shape, t_max if there is none."""
+    p = (row[2], row[3], row[4])
+    if row[0] == PLANE:
+        n = (row[5], row[6], row[7])
+        facing = dot(ray[1], n)
+        t0 = dot(sub(p, ray[0]), n) / facing if facing != 0.0 else -1.0
+        t1 = t0
+    elif row[0] == SPHERE:
+        t0, t1 = sphere_roots(ray, p, row[5])
+    else:
+        t0, t1 = box_roots(ray, p, (row[5], row[6], row[7]))
+    if t0 > t1:
+        return t_max
+    t = t0 if t0 > EPSILON else t1
+    return t if EPSILON < t < t_max else t_max
+
+
+@jit
+def shape_normal(row, p):
+    if row[0] == PLANE:
+        return (row[5], row[6], row[7])
+    if row[0] == SPHERE:
+        return unit(sub(p, (row[2], row[3], row[4])))
+    axis, far = 0, -1.0
+    for k in range(3):
+        middle, half = 0.5 * (row[2 + k] + row[5 + k]), 0.5 * (row[5 + k] - row[2 + k])
+        depth = abs(p[k] - middle) / half
+        if depth > far:
+            axis, far = k, depth
+    s = 1.0 if p[axis] > 0.5 * (row[2 + axis] + row[5 + axis]) else -1.0
+    return (s if axis == 0 else 0.0, s if axis == 1 else 0.0, s if axis == 2 else 0.0)
+
+
+@jit
+def hit_triangle(row, ray, t_max):
+    """Moller & Trumbore 1997; both sides."""
+    eu, ev = (row[4], row[5], row[6]), (row[7], row[8], row[9])
+    h = cross(ray[1], ev)
+    det = dot(eu, h)
+    if det == 0.0:
+        return t_max
+    s = sub(ray[0], (row[1], row[2], row[3]))
+    u = dot(s, h) / det
+    if u < 0.0 or u > 1.0:
+        return t_max
+    q = cross(s, eu)
+    v = dot(ray[1], q) / det
+    t = dot(ev, q) / det
+    return t if v >= 0.0 and u + v <= 1.0 and EPSILON < t < t_max else t_max
+
+
+@jit
+def intersect(g, ray, t_max):
+    """(t, n, material) of the nearest surface before t_max; material -1 if there is none."""
+    best, n, material = t_max, (0.0, 0.0, 1.0), -1
+    which = -1
+    for k in range(g.shapes.shape[0]):
+        t = hit_shape(g.shapes[k], ray, best)
+        if t < best:
+            best, which = t, k
+    if which >= 0:
+        n, material = shape_normal(g.shapes[which], along(ray, best)), int(g.shapes[which, 1])
+    if g.bvh.shape[0] > 0:
+        t, which = hit_mesh(g, ray, best)
+        if which >= 0:
+            r = g.triangles[which]
+            best, material = t, int(r[0])
+            n = unit(cross((r[4], r[5], r[6]), (r[7], r[8], r[9])))
+    return best, n, material
+
+
+@jit
+def hit_mesh(g, ray, t_max):
+    """(t, triangle) of the nearest triangle through the hierarchy, triangle -1 if there is none."""
+    stack = np.empty(64, np.int64)
+    stack[0], depth = 0, 1
+    best, which = t_max, -1
+    while depth > 0:
+        depth -= 1
+        node = g.bvh[stack[depth]]
+        t0, t1 = box_roots(ray, (node[0], node[1], node[2]), (node[3], node[4], node[5]))
+        if t0 > t1 or t1 < 0.0 or t0 > best:
+            continue
+        if node[7] > 0.0:
+            for k in range(int(node[6]), int(node[6] + node[7])):
+                t = hit_triangle(g.triangles[k], ray, best)
+                if t < best:
+                    best, which = t, k
+        else:
+            stack[depth + 1] = stack[depth] + 1
+            stack[depth] = int(node[6])
+            depth += 2
+    return best, which
