@@ -14,7 +14,8 @@ ROOT = Path(__file__).resolve().parent.parent
 LAYERS: dict[int, set[str]] = {
     # mathematics and files, no state
     0: {
-        "errors", "files", "arrayfile", "native", "lens", "cameras", "sh", "quadrature", "sampling", "losses", "metrics",
+        "errors", "files", "arrayfile", "native",
+        "lens", "cameras", "sh", "quadrature", "sampling", "losses", "metrics",
     },
     # representations
     1: {"encodings", "fields", "occupancy", "octree", "octree_codec", "octree_io"},

@@ -7,7 +7,7 @@ camera-to-world ``transform_matrix`` in OpenGL axes. Formats and sources: docs/d
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from nerfvol.cameras import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
+from nerfvol.datasets.dataset import check_box
 from nerfvol.datasets.frames import Calibration, Frame, ImageFinder, Listing, hold_out
 from nerfvol.errors import InputError
 from nerfvol.files import read_json
@@ -164,17 +165,8 @@ def _hint(data: Mapping[str, Any]) -> BoundsHint:
             aabb = np.array(aabb, dtype=np.float64)
         except (TypeError, ValueError):
             raise InputError(f"aabb must be two corners of three numbers, got {aabb!r:.60}") from None
+        aabb = check_box(aabb, "aabb")
     scale = _number(data, "aabb_scale")
     if scale is not None and scale <= 0:
         raise InputError(f"aabb_scale must be positive, got {scale:g}")
     return BoundsHint(aabb=aabb, aabb_scale=scale)
-
-
-def listed_names(frames: Sequence[Frame]) -> list[str]:
-    """One unique name a frame, fit for a file name: the image's stem, or its path with _ for / where stems repeat."""
-    paths = [Path(frame.listed.replace("\\", "/")) for frame in frames]
-    stems = [p.stem if p.suffix else p.name for p in paths]
-    if len(set(stems)) == len(stems):
-        return stems
-    long = ["_".join(part for part in p.with_suffix("").parts if part not in (".", "..", "/")) for p in paths]
-    return [f"{i:04d}_{name}" for i, name in enumerate(long)] if len(set(long)) < len(long) else long

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -103,6 +104,17 @@ def hold_out(frames: list[Frame], split: str) -> tuple[list[Frame], list[Frame],
     share = f"{len(held)} of {len(ordered)}"
     sentence = f"no split in the file: every {HOLD_OUT_EVERY}th view by name is held out ({share})"
     return (kept if split == "train" else held), kept, sentence
+
+
+def listed_names(frames: Sequence[Frame]) -> list[str]:
+    """One unique name a frame, fit for a file name: the image's stem, or its path with _ for / where stems repeat."""
+    paths = [Path(frame.listed.replace("\\", "/")) for frame in frames]
+    paths = [p.with_suffix("") if p.suffix.lower() in SUFFIXES else p for p in paths]
+    stems = [p.name for p in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    long = ["_".join(part for part in p.parts if part not in (".", "..", "/")) for p in paths]
+    return [f"{i:04d}_{name}" for i, name in enumerate(long)] if len(set(long)) < len(long) else long
 
 
 class ImageFinder:

@@ -16,9 +16,10 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from nerfvol.errors import InputError
+from nerfvol.files import explain_os_error
 
 UInt8 = NDArray[np.uint8]
 Item = TypeVar("Item")
@@ -50,8 +51,12 @@ def _open(path: Path) -> Image.Image:
         raise InputError(f"{path}: images of more than {MAX_PIXELS // 10**6} million pixels are refused") from error
     except FileNotFoundError as error:
         raise InputError(f"{path}: expected an image, but there is no such file") from error
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: expected a PNG or JPEG image, but its content is none") from error
+    except OSError as error:
+        raise InputError(f"{path}: the image cannot be read: {explain_os_error(error)}") from error
     except _DECODE_ERRORS as error:
-        raise InputError(f"{path}: expected a PNG or JPEG image, but it cannot be read ({error})") from error
+        raise InputError(f"{path}: the image is damaged ({error})") from error
     if image.width * image.height > MAX_PIXELS:
         image.close()
         raise InputError(

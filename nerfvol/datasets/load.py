@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerfvol.cameras import Camera
-from nerfvol.datasets.blender import is_transforms_folder, listed_names, read_transforms
+from nerfvol.datasets.blender import is_transforms_folder, read_transforms
 from nerfvol.datasets.bounds import cube, estimate_bounds, require_seen
 from nerfvol.datasets.dataset import Dataset, SceneBounds, check_box
-from nerfvol.datasets.frames import Frame, Listing
+from nerfvol.datasets.frames import Frame, Listing, listed_names
 from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
 from nerfvol.errors import InputError
 
@@ -45,6 +45,7 @@ def load_dataset(
     messages = list(listing.messages)
     frames = _present(listing, messages)
     sizes = map_threads(lambda frame: image_size(frame.path), frames, threads)
+    _require_one_size(frames, sizes)
     full_size = [_camera(frame, size, listing.source) for frame, size in zip(frames, sizes, strict=True)]
     cameras = [camera.scaled(downscale) for camera in full_size]
     _require_memory(cameras, downscale)
@@ -88,9 +89,24 @@ def _present(listing: Listing, messages: list[str]) -> list[Frame]:
 
 def _camera(frame: Frame, size: tuple[int, int], source: Path) -> Camera:
     try:
-        return Camera(frame.calibration.intrinsics(*size), frame.c2w)
+        camera = Camera(frame.calibration.intrinsics(*size), frame.c2w)
+        width, height = size
+        camera.intrinsics.directions_at([(0, 0), (width, 0), (0, height), (width, height)])  # refuses a lens that folds
+        return camera
     except InputError as error:
         raise InputError(f"{source}, frame {frame.listed}: {error}") from None
+
+
+def _require_one_size(frames: Sequence[Frame], sizes: Sequence[tuple[int, int]]) -> None:
+    """A field of view shared by images of unstated size means nothing unless they are of one size."""
+    first: tuple[Frame, tuple[int, int]] | None = None
+    for frame, size in zip(frames, sizes, strict=True):
+        if frame.calibration.width is not None or frame.calibration.fx is not None:
+            continue
+        first = first or (frame, size)
+        if size != first[1]:
+            expected = f"{first[1][0]}x{first[1][1]} pixels like {first[0].listed}"
+            raise InputError(f"{frame.path}: expected an image of {expected}, got {size[0]}x{size[1]}")
 
 
 def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:

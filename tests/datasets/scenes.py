@@ -1,0 +1,98 @@
+"""Small posed scenes written to disk in each format, from cameras and images the tests know."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nerfvol.cameras import Camera, Intrinsics, orbit
+
+LENS = Intrinsics(24, 16, 30.0, 30.0, 12.0, 8.0)
+
+
+def ring(n=9, intrinsics=LENS, radius=4.0):
+    """n cameras around the origin, on two heights so that nothing about them is flat."""
+    low = orbit(n, center=(0, 0, 0), radius=radius, elevation_deg=15, intrinsics=intrinsics)
+    high = orbit(n, center=(0, 0, 0), radius=radius, elevation_deg=50, intrinsics=intrinsics)
+    return [low[i] if i % 2 else high[i] for i in range(n)]
+
+
+def random_images(n=9, size=(24, 16), channels=3, seed=0):
+    generator = np.random.default_rng(seed)
+    return [generator.integers(0, 256, (size[1], size[0], channels), dtype=np.uint8) for _ in range(n)]
+
+
+def save_images(folder: Path, images, suffix=".png") -> list[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"view_{i:03d}{suffix}" for i in range(len(images))]
+    for name, image in zip(names, images, strict=True):
+        Image.fromarray(image).save(folder / name)
+    return names
+
+
+def frame(name: str, camera: Camera, **more):
+    return {"file_path": name, "transform_matrix": camera.c2w.tolist(), **more}
+
+
+def write_json(path: Path, **data) -> Path:
+    path.write_text(json.dumps(data))
+    return path
+
+
+def write_blender(folder: Path, cameras, images, splits=("train",)) -> Path:
+    """NeRF-synthetic: camera_angle_x alone, file names without suffix, a json and a folder a split."""
+    angle = 2 * math.atan(0.5 * cameras[0].intrinsics.width / cameras[0].intrinsics.fx)
+    for split in splits:
+        names = save_images(folder / split, images)
+        frames = [frame(f"./{split}/{Path(n).stem}", c) for n, c in zip(names, cameras, strict=True)]
+        write_json(folder / f"transforms_{split}.json", camera_angle_x=angle, frames=frames)
+    return folder
+
+
+def calibration(intrinsics: Intrinsics) -> dict:
+    """The keys instant-ngp and nerfstudio use."""
+    k = intrinsics
+    return {
+        "w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy,
+        "k1": k.k1, "k2": k.k2, "k3": k.k3, "k4": k.k4, "p1": k.p1, "p2": k.p2,
+    }  # fmt: skip
+
+
+def write_instant_ngp(folder: Path, cameras, images, **more) -> Path:
+    """One transforms.json with the calibration at the top."""
+    names = save_images(folder / "images", images)
+    frames = [frame(f"images/{n}", c) for n, c in zip(names, cameras, strict=True)]
+    write_json(folder / "transforms.json", **calibration(cameras[0].intrinsics), **more, frames=frames)
+    return folder
+
+
+def write_nerfstudio(folder: Path, cameras, images, **more) -> Path:
+    """One transforms.json with a calibration in every frame."""
+    names = save_images(folder / "images", images)
+    frames = [frame(f"images/{n}", c, **calibration(c.intrinsics)) for n, c in zip(names, cameras, strict=True)]
+    write_json(folder / "transforms.json", camera_model="OPENCV", **more, frames=frames)
+    return folder
+
+
+def png_bytes(values: np.ndarray, declared: tuple[int, int] | None = None) -> bytes:
+    """A PNG (h, w, 1..4) of 8 or 16 bits a channel, written out by hand: Pillow cannot write 16-bit colour.
+
+    ``declared`` (width, height) makes the header lie about the size.
+    """
+    height, width, channels = values.shape
+    colour_type = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
+    bits = 8 * values.dtype.itemsize
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    rows = values.astype(f">u{values.dtype.itemsize}").reshape(height, -1)
+    raw = b"".join(b"\0" + row.tobytes() for row in rows)
+    header = struct.pack(">IIBBBBB", *(declared or (width, height)), bits, colour_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
