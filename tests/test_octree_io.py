@@ -2,6 +2,7 @@
 
 import json
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from safetensors.numpy import load_file, save_file
 
 from nerfvol import octree_codec, octree_io
 from nerfvol.errors import InputError
-from nerfvol.octree import Octree
+from nerfvol.octree import Octree, morton
 from nerfvol.octree_io import describe_octree, load_octree, save_octree
 
 BYTE = st.integers(0, 255)
@@ -132,6 +133,17 @@ def test_describe_reads_no_array(tmp_path):
     document = describe_octree(tmp_path / "o.safetensors")
     assert document["n_leaves"] == octree.n_leaves and document["colour"] == "half_plus_sh"
     assert document["aabb"] == [[-1.0, -2.0, 0.5], [2.0, 1.0, 3.5]]
+
+
+def test_the_documented_reader_finds_the_same_leaves(tmp_path, monkeypatch):
+    """docs/file_format.md shows how to read a file without nerfvol: run just that."""
+    monkeypatch.chdir(tmp_path)
+    octree = make_octree()
+    save_octree("octree.safetensors", octree, {})
+    text = (Path(__file__).parents[1] / "docs" / "file_format.md").read_text()
+    names: dict = {}
+    exec(text.split("```python\n")[1].split("```")[0], names)
+    assert names["leaves"] == list(zip(octree.leaf_level.tolist(), morton(octree.leaf_ijk).tolist(), strict=True))
 
 
 # ---------------------------------------------------------------- hostile files
