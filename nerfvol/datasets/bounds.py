@@ -15,6 +15,7 @@ from nerfvol.errors import InputError
 
 MARGIN = 1.03
 BACKGROUND_FACTOR = 16
+_FORWARD_FACING = 0.05  # optical axes within about 13 degrees of one another: the point they meet in is ill-defined
 _INSTANT_NGP_SCALE = 0.33  # instant-ngp maps scene x to 0.33 x + 1/2 and models a cube of side aabb_scale around 1/2
 
 
@@ -80,7 +81,7 @@ def estimate_bounds(
     center, certainty = focus_point(cameras)
     distances = np.linalg.norm(positions - center, axis=1)
     ahead = np.array([(center - camera.position) @ camera.forward > 0 for camera in cameras])
-    if hint.near_far is not None:
+    if hint.near_far is not None and certainty < _FORWARD_FACING:
         return _between(cameras, hint.near_far, has_alpha)
     if len(cameras) < 2 or certainty < 1e-3 or ahead.mean() < 0.5 or distances.max() < 1e-9:
         return _guess(cameras, has_alpha)

@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 from nerfvol.cameras import Camera
 from nerfvol.datasets.blender import is_transforms_folder, read_transforms
 from nerfvol.datasets.bounds import cube, estimate_bounds, require_seen
+from nerfvol.datasets.colmap import find_model, read_colmap
 from nerfvol.datasets.dataset import Dataset, SceneBounds, check_box
 from nerfvol.datasets.frames import Frame, Listing, listed_names
 from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
+from nerfvol.datasets.llff import is_llff_folder, read_llff
 from nerfvol.errors import InputError
 
 SPLITS = ("train", "val", "test")
@@ -27,7 +29,7 @@ def load_dataset(
     """Loads one split of a folder of posed images, whatever its format (docs/data.md).
 
     Args:
-        path: a folder with transforms*.json and images, or one such json file.
+        path: a folder with transforms*.json, LLFF poses or a COLMAP model, and images; or one transforms*.json.
         split: "train", "val" or "test".
         downscale: area-averages the images (premultiplied by alpha) over downscale x downscale pixels.
         scene_override: bounds to use instead of those worked out: a SceneBounds, or the region of detail as six numbers
@@ -67,7 +69,14 @@ def _read_listing(path: Path, split: str) -> Listing:
         raise InputError(f"{path}: expected a folder with posed images, but there is no such folder")
     if path.is_file() or is_transforms_folder(path):
         return read_transforms(path, split)
-    raise InputError(f"{path}: expected posed images, but found no transforms.json or transforms_train.json")
+    if is_llff_folder(path):
+        return read_llff(path, split)
+    if find_model(path) is not None:
+        return read_colmap(path, split)
+    raise InputError(
+        f"{path}: expected posed images, but found no transforms.json or transforms_train.json, no poses_bounds.npy "
+        "and no COLMAP model in sparse/0"
+    )
 
 
 def _present(listing: Listing, messages: list[str]) -> list[Frame]:

@@ -57,12 +57,13 @@ def test_fisheye_lenses_are_read(tmp_path, key, value):
 def test_a_frames_own_figures_win(tmp_path):
     names = scenes.save_images(tmp_path, scenes.random_images(2))
     own, other = scenes.ring(2)
-    frames = [scenes.frame(names[0], own, fl_x=25.0, fl_y=26.0, cx=10.0), scenes.frame(names[1], other)]
+    frames = [scenes.frame(names[0], own, fl_x=25.0, fl_y=26.0, cx=10.0, k1=0.2), scenes.frame(names[1], other)]
     scenes.write_json(tmp_path / "transforms_train.json", camera_angle_x=1.0, k1=0.1, frames=frames)
     scenes.write_json(tmp_path / "transforms_val.json", camera_angle_x=1.0, frames=frames)
     first, second = (c.intrinsics for c in load_dataset(tmp_path).cameras)
-    assert (first.fx, first.fy, first.cx, first.cy, first.k1) == (25.0, 26.0, 10.0, 8.0, 0.1)
-    assert math.isclose(second.fx, 12 / math.tan(0.5)) and second.fy == second.fx and second.cx == 12
+    assert (first.fx, first.fy, first.cx, first.cy, first.k1) == (25.0, 26.0, 10.0, 8.0, 0.2)
+    assert math.isclose(second.fx, 12 / math.tan(0.5))
+    assert (second.fy, second.cx, second.k1) == (second.fx, 12, 0.1)
 
 
 def test_both_angles_and_degrees(tmp_path):
