@@ -23,7 +23,7 @@ LAYERS: dict[int, set[str]] = {
     2: {"kernels"},
     # use: data in, training, pictures and records out
     3: {
-        "datasets", "camera_paths", "pictures", "config", "options", "runs", "machine", "checkpoint", "tiles",
+        "datasets", "camera_paths", "pictures", "config", "options", "runs", "machine", "memory", "checkpoint", "tiles",
         "train_field", "distill", "finetune", "trainer", "render", "evaluate",
     },
     # what a person calls
