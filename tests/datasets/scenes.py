@@ -96,3 +96,74 @@ def png_bytes(values: np.ndarray, declared: tuple[int, int] | None = None) -> by
     raw = b"".join(b"\0" + row.tobytes() for row in rows)
     header = struct.pack(">IIBBBBB", *(declared or (width, height)), bits, colour_type, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
+
+
+def write_llff(folder: Path, cameras, images, *, factor=4, near_far=(2.0, 9.0)) -> Path:
+    """poses_bounds.npy for originals ``factor`` times as large as the images, which lie in images_<factor>."""
+    save_images(folder / f"images_{factor}", images)
+    rows = []
+    for camera in cameras:
+        right, up, back, position = camera.c2w[:3].T
+        k = camera.intrinsics
+        size = [factor * k.height, factor * k.width, factor * k.fx]
+        rows.append([*np.stack([-up, right, back, position, size], axis=1).ravel(), *near_far])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of a rotation: the eigenvector of the symmetric matrix that measures agreement (Bar-Itzhack)."""
+    r = rotation
+    k = np.array([
+        [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+        [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+        [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1]],
+    ])  # fmt: skip
+    return np.linalg.eigh(k)[1][:, -1]
+
+
+def colmap_pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera quaternion and translation in OpenCV axes."""
+    rotation = (camera.c2w[:3, :3] * (1, -1, -1)).T
+    return quaternion(rotation), -rotation @ camera.c2w[:3, 3]
+
+
+def write_colmap(folder: Path, cameras, images, *, model="OPENCV", text=False, stretch=1.0) -> Path:
+    """sparse/0 with one camera an image; ``stretch`` scales the quaternions, which mean the same rotation."""
+    names = save_images(folder / "images", images)
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True, exist_ok=True)
+    number = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}[model]
+    parameters = [colmap_parameters(camera.intrinsics, model) for camera in cameras]
+    poses = [colmap_pose(camera) for camera in cameras]
+    if text:
+        rows = [f"{i + 1} {model} {c.intrinsics.width} {c.intrinsics.height} " + " ".join(map(repr, map(float, p)))
+                for i, (c, p) in enumerate(zip(cameras, parameters, strict=True))]  # fmt: skip
+        (target / "cameras.txt").write_text("# Camera list\n" + "\n".join(rows) + "\n")
+        views = [f"{i + 1} " + " ".join(repr(float(v)) for v in (*stretch * q, *t)) + f" {i + 1} {n}\n\n"
+                 for i, ((q, t), n) in enumerate(zip(poses, names, strict=True))]  # fmt: skip
+        (target / "images.txt").write_text("# Image list\n" + "".join(views))
+        return folder
+    data = struct.pack("<Q", len(cameras))
+    for i, (camera, p) in enumerate(zip(cameras, parameters, strict=True)):
+        data += struct.pack("<iiQQ", i + 1, number, camera.intrinsics.width, camera.intrinsics.height)
+        data += struct.pack(f"<{len(p)}d", *p)
+    (target / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(cameras))
+    for i, ((q, t), name) in enumerate(zip(poses, names, strict=True)):
+        features = struct.pack("<ddq", 1.0, 2.0, -1) * i
+        data += struct.pack("<i7di", i + 1, *(stretch * q), *t, i + 1) + name.encode() + b"\0"
+        data += struct.pack("<Q", i) + features
+    (target / "images.bin").write_bytes(data)
+    return folder
+
+
+def colmap_parameters(k: Intrinsics, model: str) -> list[float]:
+    shared = [k.fx, k.fy, k.cx, k.cy]
+    return {
+        "PINHOLE": shared,
+        "OPENCV": [*shared, k.k1, k.k2, k.p1, k.p2],
+        "OPENCV_FISHEYE": [*shared, k.k1, k.k2, k.k3, k.k4],
+        "FULL_OPENCV": [*shared, k.k1, k.k2, k.p1, k.p2, k.k3, 0.0, 0.0, 0.0],
+    }[model]

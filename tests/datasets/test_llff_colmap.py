@@ -1,0 +1,166 @@
+"""LLFF and COLMAP say the same of a scene as transforms.json, and damaged files are refused."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerfvol.cameras import Camera
+from nerfvol.datasets import load_dataset
+from nerfvol.errors import InputError
+from tests.datasets import scenes
+
+LENSES = {
+    "PINHOLE": replace(scenes.LENS, fy=31.0, cx=11.5),
+    "OPENCV": replace(scenes.LENS, k1=0.05, k2=-0.03, p1=0.004, p2=-0.002),
+    "FULL_OPENCV": replace(scenes.LENS, k1=0.05, k2=-0.03, k3=0.01, p1=0.004, p2=-0.002),
+    "OPENCV_FISHEYE": replace(scenes.LENS, k1=0.05, k2=-0.03, k3=0.01, k4=0.002, fisheye=True),
+}
+
+
+def agree(found, expected):
+    """Two loaders' views of one scene: the same names, pixels and rays."""
+    assert found.names == expected.names and len(found) > 0
+    for a, b in zip(found.images, expected.images, strict=True):
+        np.testing.assert_array_equal(a, b)
+    for a, b in zip(found.cameras, expected.cameras, strict=True):
+        assert a.intrinsics.fisheye == b.intrinsics.fisheye
+        np.testing.assert_allclose(a.position, b.position, atol=1e-12)
+        np.testing.assert_allclose(a.rays()[1], b.rays()[1], atol=4 * 2.0**-23)
+
+
+def reference(folder, cameras, images):
+    folder.mkdir()
+    fisheye = {"is_fisheye": True} if cameras[0].intrinsics.fisheye else {}
+    return scenes.write_instant_ngp(folder, cameras, images, **fisheye)
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("text", [False, True])
+def test_colmap_agrees_with_transforms(tmp_path, model, text):
+    cameras, images = [Camera(LENSES[model], c.c2w) for c in scenes.ring()], scenes.random_images()
+    scenes.write_colmap(tmp_path, cameras, images, model=model, text=text)
+    other = reference(tmp_path / "other", cameras, images)
+    for split in ("train", "val"):
+        agree(load_dataset(tmp_path, split), load_dataset(other, split))
+
+
+def test_quaternions_of_any_length_are_rotations(tmp_path):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), stretch=-1.01)
+    agree(load_dataset(tmp_path), load_dataset(reference(tmp_path / "other", scenes.ring(), scenes.random_images())))
+
+
+def test_llff_agrees_with_transforms(tmp_path):
+    cameras, images = scenes.ring(), scenes.random_images()
+    scenes.write_llff(tmp_path, cameras, images)
+    other = reference(tmp_path / "other", cameras, images)
+    agree(load_dataset(tmp_path), load_dataset(other))
+    np.testing.assert_allclose(load_dataset(tmp_path).scene.aabb, load_dataset(other).scene.aabb, atol=1e-12)
+
+
+def test_forward_facing_bounds_hold_what_lies_between_near_and_far(tmp_path):
+    poses = [np.eye(4) for _ in range(9)]
+    for i, pose in enumerate(poses):
+        pose[:2, 3] = 0.1 * (i % 3), 0.1 * (i // 3)
+    scenes.write_llff(tmp_path, [Camera(scenes.LENS, pose) for pose in poses], scenes.random_images())
+    scene = load_dataset(tmp_path).scene
+    # looking down -z from z = 0: depths 2 to 9, at 9 the image is 9 * 24 / 30 = 7.2 wide
+    assert scene.aabb[0, 2] <= -9 and scene.aabb[1, 2] >= -2 and scene.aabb[1, 2] < 0.5
+    half = (7.2 + 0.2) / 2
+    np.testing.assert_allclose(scene.aabb[:, 0], [0.1 - half, 0.1 + half], atol=1e-12)
+    assert scene.background_cube is not None
+
+
+def test_the_largest_copy_of_the_photographs_is_taken(tmp_path):
+    scenes.write_llff(tmp_path, scenes.ring(), scenes.random_images(), factor=4)
+    scenes.save_images(tmp_path / "images_8", scenes.random_images(size=(12, 8)))
+    (tmp_path / "images_old").mkdir()
+    assert load_dataset(tmp_path).images[0].shape == (16, 24, 3)
+    for path in (tmp_path / "images_4").iterdir():
+        path.unlink()
+    (tmp_path / "images_4").rmdir()
+    small = load_dataset(tmp_path)
+    assert small.images[0].shape == (8, 12, 3) and small.cameras[0].intrinsics.fx == 15
+
+
+def test_missing_photographs_of_a_model_are_left_out(tmp_path):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images())
+    (tmp_path / "images" / "view_003.png").unlink()
+    dataset = load_dataset(tmp_path)
+    assert dataset.names == [f"view_{i:03d}" for i in (1, 2, 4, 5, 6, 7, 8)]  # view_000 alone is held out of eight
+    assert any("lists 1 images that are not on disk" in message for message in dataset.messages)
+
+
+def edit(path, change):
+    path.write_bytes(change(path.read_bytes()))
+
+
+@pytest.mark.parametrize("name,change,sentence", [
+    ("images.bin", lambda d: d[:100], "truncated"),
+    ("images.bin", lambda d: d[:-5], "truncated"),
+    ("images.bin", lambda d: struct.pack("<Q", 2**60) + d[8:], "truncated"),
+    ("images.bin", lambda d: d[:72] + b"\xff" + d[73:], "no text"),
+    ("images.bin", lambda d: d[:12] + struct.pack("<d", 3.0) + d[20:], "unit quaternion"),
+    ("images.bin", lambda d: d[:44] + struct.pack("<d", np.nan) + d[52:], "finite translation"),
+    ("images.bin", lambda d: d[:68] + struct.pack("<i", 99) + d[72:], "camera 99 is not in the model"),
+    ("images.bin", lambda d: struct.pack("<Q", 0), "holds no images"),
+    ("cameras.bin", lambda d: d[:20], "truncated"),
+    ("cameras.bin", lambda d: d[:12] + struct.pack("<i", 7) + d[16:], "lens model 7 is not supported"),
+    ("cameras.bin", lambda d: d[:32] + struct.pack("<d", np.inf) + d[40:], "finite parameters"),
+    ("cameras.bin", lambda d: d[:32] + struct.pack("<d", -1.0) + d[40:], "focal lengths must be positive"),
+    ("cameras.bin", lambda d: d[:16] + struct.pack("<Q", 0) + d[24:], "finite parameters"),
+    ("cameras.bin", lambda d: d[:16] + struct.pack("<Q", 48) + d[24:], "expected an image of 48x16"),
+])  # fmt: skip
+def test_damaged_colmap_models_are_refused(tmp_path, name, change, sentence):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images())
+    edit(tmp_path / "sparse" / "0" / name, change)
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_dataset(tmp_path, "val")  # the damage is in the first camera and image, which are held out
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name,old,new,sentence", [
+    ("cameras.txt", "OPENCV", "FOV", "unknown lens model"), ("cameras.txt", " 24 ", " wide ", "expected CAMERA_ID"),
+    ("images.txt", "view_000.png", "", "expected IMAGE_ID"), ("images.txt", "1 ", "1 x ", "expected IMAGE_ID"),
+])  # fmt: skip
+def test_damaged_text_models_are_refused(tmp_path, name, old, new, sentence):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), text=True)
+    edit(tmp_path / "sparse" / "0" / name, lambda data: data.replace(old.encode(), new.encode(), 1))
+    with pytest.raises(InputError, match=sentence):
+        load_dataset(tmp_path)
+
+
+def test_rational_distortion_is_refused(tmp_path):
+    cameras = [Camera(LENSES["FULL_OPENCV"], c.c2w) for c in scenes.ring()]
+    scenes.write_colmap(tmp_path, cameras, scenes.random_images(), model="FULL_OPENCV")
+    edit(tmp_path / "sparse/0/cameras.bin", lambda d: d[: 32 + 9 * 8] + struct.pack("<d", 0.1) + d[32 + 10 * 8 :])
+    with pytest.raises(InputError, match="rational terms"):
+        load_dataset(tmp_path)
+
+
+def rows(folder):
+    return np.load(folder / "poses_bounds.npy")
+
+
+@pytest.mark.parametrize("make,sentence", [
+    (lambda r: r[:5], "holds 5 poses, but images_4 holds 9 images"),
+    (lambda r: r[:, :16], r"shape \(views, 17\), got \(9, 16\)"),
+    (lambda r: np.where(r == r[2, 3], np.nan, r), "finite"),
+    (lambda r: r.astype(complex), "floating-point"),
+    (lambda r: np.concatenate([r[:, :15], r[:, 16:], r[:, 15:16]], axis=1), "0 < near < far"),
+    (lambda r: np.concatenate([2 * r[:, :3], r[:, 3:]], axis=1), "rigid"),
+    (lambda r: np.array([{"a": 1}]), "cannot be read"),
+])  # fmt: skip
+def test_damaged_llff_poses_are_refused(tmp_path, make, sentence):
+    scenes.write_llff(tmp_path, scenes.ring(), scenes.random_images())
+    np.save(tmp_path / "poses_bounds.npy", make(rows(tmp_path)), allow_pickle=True)
+    with pytest.raises(InputError, match=sentence):
+        load_dataset(tmp_path)
+
+
+def test_poses_that_are_no_array_are_refused(tmp_path):
+    scenes.write_llff(tmp_path, scenes.ring(), scenes.random_images())
+    (tmp_path / "poses_bounds.npy").write_bytes(b"\x80\x04not an array")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_dataset(tmp_path)
