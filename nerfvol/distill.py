@@ -165,10 +165,11 @@ class Frame:
         edge = self.size / 2**level
         low = self.origin + ijk * edge - self.center
         nearest = np.maximum(np.maximum(low, -(low + edge)), 0).max(1)  # Chebyshev distance of the cell's nearest point
-        shells = np.ceil(np.log2(np.maximum(nearest / self.half + 1e-9, 1)) - 1e-6)
-        # A cell that touches the detail cube from outside belongs to the first shell.
-        outside = nearest >= self.half * (1 - 1e-9)
-        return self.finest - np.where(outside, np.maximum(shells, 1), 0).astype(np.int64)
+        # Shell k holds distances from 2**(k - 1) to 2**k; the detail cube itself is 0.
+        shells = np.where(
+            nearest < self.half * (1 - 1e-9), 0, np.floor(np.log2(np.maximum(nearest / self.half, 1)) + 1e-9) + 1
+        )
+        return self.finest - shells.astype(np.int64)
 
 
 @torch.no_grad()

@@ -1,0 +1,300 @@
+"""Distillation: an analytic field comes back with the error that interpolation predicts; topology, merging, pruning."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nerfvol import sh as spherical
+from nerfvol.cameras import Camera, Intrinsics, orbit
+from nerfvol.datasets import Dataset, SceneBounds
+from nerfvol.distill import (
+    DistillConfig,
+    Frame,
+    candidate_cells,
+    dilated,
+    distill,
+    largest_weights,
+    merge_smooth,
+    write_values,
+)
+from nerfvol.errors import InputError
+from nerfvol.fields import Domain
+from nerfvol.octree import OFFSETS, Octree, explin
+
+DOMAIN = Domain((0.1, -0.2, 0.3), 1.0)
+CENTER = torch.tensor(DOMAIN.center)
+
+
+class Blob:
+    """sigma = peak exp(-|x|^2 / (2 s^2)), SH colour that varies linearly in space."""
+
+    has_sh, sh_degree = True, 1
+
+    def __init__(self, peak: float = 20.0, width: float = 0.25) -> None:
+        self.peak, self.width = peak, width
+
+    def density(self, positions: torch.Tensor) -> torch.Tensor:
+        x = positions - CENTER.to(positions.dtype)
+        return self.peak * torch.exp(-x.square().sum(-1) / (2 * self.width**2))
+
+    def sh(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        rows = torch.stack([positions * 0.3, 0.1 - positions * 0.2, positions.flip(-1), positions * 0.05], dim=-1)
+        return self.density(positions), rows
+
+    def __call__(self, positions: torch.Tensor, viewdirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        sigma, coefficients = self.sh(positions)
+        return sigma, spherical.eval_colour(coefficients, viewdirs)
+
+    def image(self, camera: Camera, background: tuple[float, float, float]) -> np.ndarray:
+        """Quadrature of the field itself, 400 midpoints a ray."""
+        from nerfvol.quadrature import accumulate, composite
+
+        o, d = (torch.from_numpy(a) for a in camera.rays())
+        near, far, n = 1.5, 4.5, 400
+        t = near + (far - near) * (torch.arange(n) + 0.5) / n
+        points = (o + d[:, None] * t[:, None]).reshape(-1, 3)
+        sigma, rgb = self(points, d.repeat_interleave(n, 0))
+        parts = composite(sigma.view(len(d), n), torch.tensor((far - near) / n))
+        colour = accumulate(parts.weights, rgb.view(len(d), n, 3)) + parts.trans_final[:, None] * torch.tensor(
+            background
+        )
+        return colour.clamp(0, 1).numpy().reshape(camera.intrinsics.height, camera.intrinsics.width, 3)
+
+
+def views(field: Blob, n: int = 6, size: int = 48) -> Dataset:
+    lens = Intrinsics(size, size, 1.5 * size, 1.5 * size, size / 2, size / 2)
+    cameras = orbit(n, center=DOMAIN.center, radius=3.0, elevation_deg=15, intrinsics=lens)
+    images = [np.rint(field.image(camera, (1, 1, 1)) * 255).astype(np.uint8) for camera in cameras]
+    low, high = DOMAIN.aabb.double().numpy()
+    return Dataset(
+        cameras, images, [f"v{i}" for i in range(n)], SceneBounds(np.stack([low, high]), None, False), "test"
+    )
+
+
+def full_octree(level: int, density_scale: float = 100.0) -> Octree:
+    ijk = np.array(list(np.ndindex(*[1 << level] * 3)))
+    origin, size = np.array(DOMAIN.center) - DOMAIN.half, 2 * DOMAIN.half
+    return Octree.from_leaves(np.full(len(ijk), level), ijk, origin, size, 1, density_scale)
+
+
+def interpolate(octree: Octree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Leaf, sigma and sh at points, by the octree's documented formula written out here."""
+    leaf = octree.query(points)
+    assert (leaf >= 0).all()
+    f = (points - octree.origin) / octree.leaf_sizes()[leaf][:, None] - octree.leaf_ijk[leaf]
+    weights = np.prod(np.where(OFFSETS[None] == 1, f[:, None], 1 - f[:, None]), axis=-1)
+    corners = octree.corners[leaf]
+    raw = (weights * octree.density[corners]).sum(1)
+    coefficients = (weights[..., None, None] * octree.sh[corners]).sum(1)
+    return leaf, octree.density_scale * explin(raw), coefficients
+
+
+def random_points(n: int, reach: float) -> np.ndarray:
+    return np.array(DOMAIN.center) + np.random.default_rng(0).uniform(-reach, reach, (n, 3))
+
+
+@pytest.mark.parametrize("samples", [1, 8])
+def test_error_of_the_values_is_second_order(samples: int) -> None:
+    """Halving the leaves divides the error of the coefficient by four; the linear colour is met at every size."""
+    field, points, errors = Blob(), random_points(3000, 0.6), []
+    truth_sigma, truth_sh = (a.numpy() for a in field.sh(torch.from_numpy(points)))
+    levels = [3, 4, 5]
+    for level in levels:
+        octree = full_octree(level)
+        write_values(octree, field, samples)
+        _, sigma, coefficients = interpolate(octree, points)
+        errors.append(np.sqrt(np.mean((sigma - truth_sigma) ** 2)))
+        if samples == 1:
+            np.testing.assert_allclose(coefficients, truth_sh, atol=1e-5)
+    slope = -np.polyfit(levels, np.log2(errors), 1)[0]
+    assert slope == pytest.approx(2, abs=0.15)
+    # The bound of trilinear interpolation, in raw density where the Gaussian is a parabola: h^2 / 8 times the sum of
+    # second derivatives, 3 / s^2, and at most the peak to multiply it.
+    if samples == 1:
+        h = 2 / 2 ** levels[-1]
+        assert errors[-1] < field.peak * h * h / 8 * 3 / field.width**2
+
+
+def test_opacity_is_the_closed_form() -> None:
+    """A line integral of a Gaussian is an error function: rays at several distances from the middle."""
+    from nerfvol.kernels.ops import render_rays
+
+    field = Blob(peak=3.0)
+    octree = full_octree(5, density_scale=4.0)  # what an "empty" vertex has is then 0.0013 / u
+    write_values(octree, field, 1)
+    miss = torch.linspace(0, 0.5, 16)
+    o = torch.stack([CENTER[0] + miss, CENTER[1] + 0 * miss, CENTER[2] - 3 + 0 * miss], dim=-1)
+    d = torch.tensor([[0.0, 0, 1]]).expand(16, 3).contiguous()
+    opacity = render_rays(octree, o, d, (1, 1, 1), 0.0, ("opacity",))["opacity"]
+    half_length = math.erf(1 / (field.width * math.sqrt(2)))
+    tau = field.peak * torch.exp(-(miss**2) / (2 * field.width**2)) * field.width * math.sqrt(2 * math.pi) * half_length
+    # Coefficient error of the test above at this level, h^2 / 8 * 3 / s^2 = 2.3 %, on tau exp(-tau) <= 1 / e; and the
+    # empty vertices along 2 u.
+    torch.testing.assert_close(opacity, -torch.expm1(-tau), rtol=0, atol=0.023 / math.e + 0.003)
+
+
+def test_whole_distillation_loses_little() -> None:
+    field = Blob()
+    dataset = views(field)
+    config = DistillConfig(level=5, coarse_level=3, compare_views=3, compare_downscale=1, visibility_downscale=1)
+    octree, report = distill(
+        field, DOMAIN, dataset, (1, 1, 1), config, render_field=lambda camera: field.image(camera, (1, 1, 1))
+    )
+    octree.validate()
+    assert report.field_psnr > 50  # only the rounding to 8 bits
+    assert report.octree_psnr > 35 and report.lost_db == report.field_psnr - report.octree_psnr
+    assert report.leaves == octree.n_leaves == sum(report.leaves_per_level.values()) < 32**3 // 3
+    assert report.pruned > 0 and report.merged > 0 and len(report.leaves_per_level) >= 2
+    assert report.candidates == report.leaves + report.pruned + report.merged
+    assert f"{report.leaves} leaves" in str(report) and "dB lost" in str(report)
+
+
+def test_candidates_cover_what_is_dense_and_little_else() -> None:
+    config = DistillConfig(level=5, coarse_level=3, empty_opacity=0.01)
+    field, frame = Blob(width=0.1), Frame.of(DOMAIN, 5)
+    level, ijk = candidate_cells(field, frame, config, [])
+    assert (level == 5).all() and len(np.unique(ijk, axis=0)) == len(ijk)
+    threshold = -math.log1p(-0.01) / (2 / 32)
+    # The sphere where a leaf is just opaque enough, plus a dilated cell and half a cell diagonal.
+    radius = 0.1 * math.sqrt(2 * math.log(20 / threshold))
+    everywhere = np.array(list(np.ndindex(32, 32, 32)))
+    distance = np.linalg.norm(frame.origin + (everywhere + 0.5) / 16 - np.array(DOMAIN.center), axis=1)
+    keys = {tuple(c) for c in ijk.tolist()}
+    found = np.array([tuple(c) in keys for c in everywhere.tolist()])
+    assert found[distance < radius].all()
+    assert not found[distance > radius + (1 + math.sqrt(3)) * 2 / 32 + math.sqrt(3) / 16].any()
+
+
+def test_dilation_is_one_cell() -> None:
+    cells = np.array(list(np.ndindex(5, 5, 5)))
+    holds = (cells == (2, 2, 2)).all(1) | (cells == (0, 0, 4)).all(1)
+    kept = dilated(cells, holds, 5)
+    near = [(np.abs(cells - np.array(c)).max(1) <= 1) for c in ((2, 2, 2), (0, 0, 4))]
+    np.testing.assert_array_equal(kept, near[0] | near[1])
+
+
+def test_leaves_grow_outside_the_detail() -> None:
+    """With a background: full level inside the detail cube, one level less at each doubling of the distance."""
+
+    class Everywhere(Blob):
+        def density(self, positions: torch.Tensor) -> torch.Tensor:
+            return torch.full((len(positions),), 5.0)
+
+    domain = Domain((0.0, 0.0, 0.0), 1.0, outer=4.0)
+    frame = Frame.of(domain, 3)
+    assert frame.size == 8 and frame.finest == 5
+    level, ijk = candidate_cells(Everywhere(), frame, DistillConfig(level=3, coarse_level=1), [])
+    octree = Octree.from_leaves(level, ijk, frame.origin, frame.size, 1, 1.0)
+    volume = (octree.leaf_sizes() ** 3).sum()
+    assert volume == pytest.approx(8**3)  # a partition of the root cube
+    distance = np.abs(octree.leaf_centers()).max(1)
+    assert (octree.leaf_level[distance < 1] == 5).all()
+    assert (octree.leaf_level[(distance > 1) & (distance < 2)] == 4).all()
+    assert (octree.leaf_level[distance > 2] == 3).all()
+
+
+def test_merging_changes_nothing_where_the_field_is_trilinear() -> None:
+    """A field that is linear in space merges to the coarsest leaves allowed, with the same values everywhere."""
+
+    class Linear(Blob):
+        def density(self, positions: torch.Tensor) -> torch.Tensor:
+            return 300 + 100 * positions[:, 0] - 50 * positions[:, 1]
+
+    octree = full_octree(4)
+    write_values(octree, Linear(), 1)
+    merged = merge_smooth(octree, 2, 1e-4)
+    merged.validate()
+    assert merged.n_leaves == 64 and (merged.leaf_level == 2).all()
+    points = random_points(500, 0.99)
+    for mine, other in zip(interpolate(merged, points)[1:], interpolate(octree, points)[1:], strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-5, atol=1e-5)
+
+
+def test_merging_keeps_within_its_tolerance() -> None:
+    octree = full_octree(5)
+    write_values(octree, Blob(), 1)
+    sizes = []
+    for tolerance in (0.003, 0.03):
+        merged = merge_smooth(octree, 2, tolerance)
+        merged.validate()
+        sizes.append(merged.n_leaves)
+        points = random_points(4000, 0.99)
+        _, sigma, _ = interpolate(merged, points)
+        _, before, _ = interpolate(octree, points)
+        edge = 2 / 2**4  # of the siblings of the second merge, whose tolerance adds to that of the first
+        assert np.abs(np.exp(-sigma * edge / 2) - np.exp(-before * edge / 2)).max() < 3 * tolerance
+    assert sizes[1] < sizes[0] < octree.n_leaves
+    assert merge_smooth(octree, 2, 0.0) is octree
+
+
+def test_a_step_is_not_merged() -> None:
+    """One differing vertex in the middle of eight siblings keeps them apart; their parents' neighbours still merge."""
+    octree = full_octree(3)
+    octree.density = np.full(octree.n_vertices, -3.0)  # an opacity of 0.37 a leaf
+    middle = np.argmin(np.abs(octree.vertex_positions() - octree.origin - 0.25).sum(1))
+    raw = octree.density.copy()
+    raw[middle] = -2.9
+    octree.density = raw
+    merged = merge_smooth(octree, 2, 1e-3)
+    assert merged.n_leaves == 63 + 8 and (merged.leaf_level == 3).sum() == 8
+    np.testing.assert_array_equal(merged.leaf_ijk[merged.leaf_level == 3].max(0), [1, 1, 1])
+
+
+def test_hidden_leaves_have_no_weight() -> None:
+    """An opaque shell: what the cameras see has weight, the core behind it none."""
+    octree = full_octree(4)
+    octree.density = np.full(octree.n_vertices, 3.0)  # 300 / u in leaves of 1/8: each hides what is behind
+    weights = largest_weights(octree, views(Blob()), (1, 1, 1), 1)
+    ring = np.minimum(octree.leaf_ijk, 15 - octree.leaf_ijk).min(1)
+    assert weights[ring >= 3].max() < 1e-3
+    side = (octree.leaf_ijk[:, 0] == 15) & (np.abs(octree.leaf_ijk[:, 1:] - 7.5).max(1) < 3)
+    assert side.sum() > 20 and weights[side].min() > 0.5
+
+
+def test_fields_without_an_sh_head_are_projected() -> None:
+    """Colour of degree 1 in the direction comes back exactly; degree 2 in it does not disturb degree 1."""
+
+    class View(Blob):
+        has_sh = False
+
+        def __call__(self, positions: torch.Tensor, viewdirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            sigma, rgb = super().__call__(positions, viewdirs)
+            return sigma, rgb + (viewdirs[:, :1] * viewdirs[:, 1:2])
+
+    octree, expected = full_octree(3), full_octree(3)
+    write_values(octree, View(), 1)
+    write_values(expected, Blob(), 1)
+    np.testing.assert_allclose(octree.sh, expected.sh, atol=2e-6)
+    np.testing.assert_array_equal(octree.density, expected.density)
+
+
+def test_colour_in_front_of_a_surface_is_the_surfaces() -> None:
+    """Averaging weighs colour by the coefficient: empty neighbours do not bleed in."""
+
+    class Half(Blob):
+        def density(self, positions: torch.Tensor) -> torch.Tensor:
+            return torch.where(positions[:, 0] > CENTER[0], 100.0, 0.0)
+
+        def sh(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            solid = (positions[:, 0] > CENTER[0]).float()
+            return self.density(positions), (solid - 0.5)[:, None, None].expand(-1, 3, 4)
+
+    octree = full_octree(3)
+    write_values(octree, Half(), 8)
+    face = np.abs(octree.vertex_positions()[:, 0] - DOMAIN.center[0]) < 1e-6
+    np.testing.assert_allclose(octree.sh[face], 0.5, atol=1e-4)
+    np.testing.assert_allclose(octree.density_scale * explin(octree.density[face]), 50, rtol=1e-4)
+
+
+def test_empty_fields_are_an_error() -> None:
+    config = DistillConfig(level=4, coarse_level=2)
+    with pytest.raises(InputError, match="field is empty.*--init direct"):
+        distill(Blob(peak=1e-6), DOMAIN, views(Blob()), (1, 1, 1), config)
+    away = views(Blob())
+    away.cameras = [Camera(c.intrinsics, np.diag([-1.0, 1, -1, 1]) @ np.eye(4)) for c in away.cameras]
+    hidden = dataclasses.replace(config, prune_weight=1.1)
+    with pytest.raises(InputError, match="training views can see"):
+        distill(Blob(), DOMAIN, away, (1, 1, 1), hidden)
