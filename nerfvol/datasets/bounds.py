@@ -137,8 +137,6 @@ def require_seen(bounds: SceneBounds, cameras: Sequence[Camera]) -> None:
     grid = low + (high - low) * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     for camera in cameras:
         i = camera.intrinsics
-        if ((camera.position > low) & (camera.position < high)).all():
-            return
         seen = camera.project(grid)
         if ((seen >= 0) & (seen <= (i.width, i.height))).all(axis=1).any():
             return

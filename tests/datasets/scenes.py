@@ -141,8 +141,10 @@ def write_colmap(folder: Path, cameras, images, *, model="OPENCV", text=False, s
         rows = [f"{i + 1} {model} {c.intrinsics.width} {c.intrinsics.height} " + " ".join(map(repr, map(float, p)))
                 for i, (c, p) in enumerate(zip(cameras, parameters, strict=True))]  # fmt: skip
         (target / "cameras.txt").write_text("# Camera list\n" + "\n".join(rows) + "\n")
-        views = [f"{i + 1} " + " ".join(repr(float(v)) for v in (*stretch * q, *t)) + f" {i + 1} {n}\n\n"
-                 for i, ((q, t), n) in enumerate(zip(poses, names, strict=True))]  # fmt: skip
+        views = []
+        for i, ((q, t), name) in enumerate(zip(poses, names, strict=True)):
+            numbers = " ".join(repr(float(v)) for v in (*stretch * q, *t))
+            views.append(f"{i + 1} {numbers} {i + 1} {name}\n" + "1.0 2.0 -1 " * i + "\n")
         (target / "images.txt").write_text("# Image list\n" + "".join(views))
         return folder
     data = struct.pack("<Q", len(cameras))

@@ -102,8 +102,9 @@ def test_bounds_must_be_seen_by_somebody():
     cameras = orbit(3, center=(0, 0, 0), radius=4, elevation_deg=0, intrinsics=NERF_SYNTHETIC)
     require_seen(box_at((0, 0, 0), 1.5), cameras)
     require_seen(box_at((0, 0, 0), 100), cameras)  # cameras inside
-    require_seen(box_at((0, 0, 0), 1e-4), cameras)  # smaller than a pixel
-    require_seen(SceneBounds([[-9, -9, -1], [9, 9, -0.9]], None, True), cameras)  # a slab wider than the view
+    require_seen(box_at((0.137, 0.211, 0.173), 1e-4), cameras)  # smaller than a pixel
+    close = [Camera(NERF_SYNTHETIC, look_at([7, -100.1, 11], [7, 0, 11]))]
+    require_seen(SceneBounds([[-100, -100, -100], [100, -99.9, 100]], None, True), close)  # a wall that fills the view
     with pytest.raises(InputError, match="seen by none of the 3 cameras"):
         require_seen(box_at((0, 0, 50), 1), cameras)
     behind = [Camera(NERF_SYNTHETIC, look_at([0, -4, 0], [0, -8, 0]))]
