@@ -88,26 +88,29 @@ def demorton(code: np.ndarray) -> np.ndarray:
 class Transfer:
     """How per-vertex and per-leaf arrays follow a change of topology.
 
-    parent: (n_leaves_new,) the old leaf that each new leaf is or lies in. corners: (n_vertices_new, 8) old vertices;
-    place: (n_vertices_new,) index into the 27 lattice points of that old leaf.
+    parent: (n_leaves_new,) the old leaf that each new leaf is or lies in. old_corners: (n_leaves_old, 8). For each new
+    vertex, source: (n_vertices_new,) an old leaf, and place: index into the 27 points of that leaf's 3x3x3 lattice.
     """
 
     parent: np.ndarray
-    corners: np.ndarray
+    old_corners: np.ndarray
+    source: np.ndarray
     place: np.ndarray
 
     def vertices(self, rows: np.ndarray) -> np.ndarray:
-        """Interpolates old per-vertex rows (n_vertices_old, k) at the new vertices."""
+        """Old per-vertex rows (n_vertices_old, k), interpolated at the new vertices."""
         out = np.empty((len(self.place), rows.shape[1]), dtype=rows.dtype)
-        copied = np.isin(self.place, _LATTICE_CORNERS)
-        out[copied] = rows[self.corners[copied, _CORNER_OF_LATTICE[self.place[copied]]]]
-        rest = np.flatnonzero(~copied)
+        compiled = native()
+        if compiled is not None and rows.dtype == np.float32:
+            compiled.interpolate(np.ascontiguousarray(rows), self.old_corners, self.source, self.place, out)
+            return out
         weights = _LATTICE_WEIGHTS.astype(rows.dtype)
-        for part in np.array_split(rest, max(1, len(rest) // 65536)):
-            w = weights[self.place[part]]
-            total = w[:, :1] * rows[self.corners[part, 0]]
+        for start in range(0, len(out), 65536):
+            part = slice(start, start + 65536)
+            w, corners = weights[self.place[part]], self.old_corners[self.source[part]]
+            total = w[:, :1] * rows[corners[:, 0]]
             for o in range(1, 8):
-                total += w[:, o : o + 1] * rows[self.corners[part, o]]
+                total += w[:, o : o + 1] * rows[corners[:, o]]
             out[part] = total
         return out
 
@@ -116,7 +119,6 @@ class Transfer:
 _LATTICE = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
 _LATTICE_WEIGHTS = np.prod(np.where(OFFSETS[None] == 1, _LATTICE[:, None] / 2, 1 - _LATTICE[:, None] / 2), axis=-1)
 _LATTICE_CORNERS = np.flatnonzero((_LATTICE % 2 == 0).all(1))
-_CORNER_OF_LATTICE = (_LATTICE // 2) @ np.array([4, 2, 1])
 _STRIDES = np.array([9, 3, 1])
 
 
@@ -289,23 +291,9 @@ class Octree:
         )
         # Bring the description of the new leaves into the new octree's order.
         order = np.lexsort((morton(ijk), level))
+        octant = np.full(len(order), -1, np.int8) if octant is None else octant[order].astype(np.int8)
         parent = parent[order]
-        if octant is None:
-            lattice = np.broadcast_to(OFFSETS * 2, (len(parent), 8, 3))
-        else:
-            octant = octant[order]
-            inside = OFFSETS[np.maximum(octant, 0)][:, None] + OFFSETS
-            lattice = np.where((octant < 0)[:, None, None], OFFSETS * 2, inside)
-        place = (lattice @ _STRIDES).astype(np.int8)
-        # One representative per vertex; a corner of an old leaf beats a point inside one.
-        rows = np.arange(new.n_leaves, dtype=np.int64).repeat(8)
-        flat, places = new.corners.ravel(), place.ravel()
-        is_corner = np.isin(places, _LATTICE_CORNERS)
-        leaf_of, place_of = np.empty(new.n_vertices, np.int64), np.empty(new.n_vertices, np.int8)
-        for chosen in (~is_corner, is_corner):
-            leaf_of[flat[chosen]] = parent[rows[chosen]]
-            place_of[flat[chosen]] = places[chosen]
-        transfer = Transfer(parent, self.corners[leaf_of], place_of)
+        transfer = Transfer(parent, self.corners, *_find_sources(new, parent, octant))
         new.values = transfer.vertices(self.values)
         return new, transfer
 
@@ -361,7 +349,8 @@ def _build_masks(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.nda
         if (np.diff(leaves) == 0).any() or np.isin(leaves, nodes_below, assume_unique=True).any():
             raise InputError("leaves overlap: one is given twice or lies inside another")
         parents_l, parents_n = leaves >> 3, nodes_below >> 3
-        nodes = np.union1d(parents_l, parents_n)
+        nodes = np.sort(np.concatenate([parents_l, parents_n]))
+        nodes = nodes[np.concatenate([[True], nodes[1:] != nodes[:-1]])]
         masks = []
         for children, parents in ((leaves, parents_l), (nodes_below, parents_n)):
             at = np.searchsorted(nodes, parents)
@@ -410,20 +399,34 @@ def _expand_topology(node_mask: np.ndarray, leaf_mask: np.ndarray):
 
 def _number_corners(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices in the order in which leaves name them: corners (n, 8) int32, positions at the finest level (m, 3)."""
-    scale = (1 << (level.max() - level)).reshape(-1, 1)
     n = len(level)
-    keys = np.empty((n, 8), dtype=np.int64)
-    for o in range(8):
-        keys[:, o] = morton((ijk + OFFSETS[o]) * scale)
-    keys = keys.reshape(-1)
     compiled = native()
     if compiled is not None:
-        ids, first = np.empty(8 * n, np.int32), np.empty(8 * n, np.int64)
-        first = first[: compiled.number_vertices(keys, ids, first)]
-    else:
-        _, at, inverse = np.unique(keys, return_index=True, return_inverse=True)
-        order = np.argsort(at)
-        rank = np.empty(len(at), np.int32)
-        rank[order] = np.arange(len(at), dtype=np.int32)
-        ids, first = rank[inverse], at[order]
-    return ids.reshape(n, 8), demorton(keys[first])
+        ids, position = np.empty((n, 8), np.int32), np.empty((8 * n, 3), np.int64)
+        m = compiled.number_corners(level, np.ascontiguousarray(ijk), int(level.max()), ids, position)
+        return ids, position[:m].copy()
+    scale = (1 << (level.max() - level)).reshape(-1, 1)
+    keys = np.stack([morton((ijk + OFFSETS[o]) * scale) for o in range(8)], 1).reshape(-1)
+    unique, at, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.argsort(at)
+    rank = np.empty(len(at), np.int32)
+    rank[order] = np.arange(len(at), dtype=np.int32)
+    return rank[inverse].reshape(n, 8), demorton(unique[order])
+
+
+def _find_sources(new: Octree, parent: np.ndarray, octant: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """source and place of :class:`Transfer`; a corner of an old leaf beats a point inside one, the first leaf a later."""
+    source, place = np.empty(new.n_vertices, np.int32), np.empty(new.n_vertices, np.int8)
+    compiled = native()
+    if compiled is not None:
+        compiled.find_sources(new.corners, parent, octant, source, place)
+        return source, place
+    inside = OFFSETS[np.maximum(octant, 0)][:, None] + OFFSETS
+    lattice = np.where((octant < 0)[:, None, None], OFFSETS * 2, inside)
+    places = (lattice @ _STRIDES).astype(np.int8).ravel()
+    leaves, flat = np.repeat(parent, 8), new.corners.ravel()
+    is_corner = np.isin(places, _LATTICE_CORNERS)
+    for chosen in (np.flatnonzero(~is_corner)[::-1], np.flatnonzero(is_corner)[::-1]):  # the first one is written last
+        source[flat[chosen]] = leaves[chosen]
+        place[flat[chosen]] = places[chosen]
+    return source, place

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "pool.h"
+#include "topology.h"
 #include "tree.h"
 
 namespace nb = nanobind;
@@ -114,9 +115,24 @@ nb::tuple py_train_step(const TreeArrays& t, Rows origins, Rows directions, Rows
     return nb::make_tuple(r.squared_error, r.weight, r.samples);
 }
 
-int64_t py_number_vertices(In<int64_t, nb::ndim<1>> keys, Out<int32_t, nb::ndim<1>> ids, Out<int64_t, nb::ndim<1>> first) {
+int64_t py_number_corners(In<int64_t, nb::ndim<1>> level, In<int64_t, nb::shape<-1, 3>> ijk, int64_t max_level,
+                          Out<int32_t, nb::shape<-1, 8>> ids, Out<int64_t, nb::shape<-1, 3>> position) {
     nb::gil_scoped_release release;
-    return number_vertices(keys.data(), int64_t(keys.shape(0)), ids.data(), first.data());
+    return number_corners(level.data(), ijk.data(), int64_t(level.shape(0)), max_level, ids.data(), position.data());
+}
+
+void py_find_sources(In<int32_t, nb::shape<-1, 8>> corners, In<int64_t, nb::ndim<1>> parent, In<int8_t, nb::ndim<1>> octant,
+                     Out<int32_t, nb::ndim<1>> source, Out<int8_t, nb::ndim<1>> place) {
+    nb::gil_scoped_release release;
+    find_sources(corners.data(), parent.data(), octant.data(), int64_t(corners.shape(0)), int64_t(source.shape(0)),
+                 source.data(), place.data());
+}
+
+void py_interpolate(Rows rows, In<int32_t, nb::shape<-1, 8>> corners, In<int32_t, nb::ndim<1>> source,
+                    In<int8_t, nb::ndim<1>> place, FloatRows out) {
+    nb::gil_scoped_release release;
+    interpolate(rows.data(), int64_t(rows.shape(1)), corners.data(), source.data(), place.data(), int64_t(source.shape(0)),
+                out.data());
 }
 
 }  // namespace
@@ -137,7 +153,9 @@ NB_MODULE(_nerfvol_kernels, m) {
           "early_stop_eps"_a, "colour"_a, "distortion"_a, "pixel_angle"_a, "gradient"_a.none(), "values"_a.none(),
           "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a, "max_weight"_a.none(), "error"_a.none(),
           "footprint"_a.none());
-    m.def("number_vertices", &py_number_vertices, "keys"_a, "ids"_a, "first"_a);
+    m.def("number_corners", &py_number_corners, "level"_a, "ijk"_a, "max_level"_a, "ids"_a, "position"_a);
+    m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);
+    m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
     m.def("isa", [] { return std::string(isa_name()); });

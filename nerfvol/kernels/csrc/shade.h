@@ -66,6 +66,7 @@ inline f8 trilinear(float fx, float fy, float fz) {
 template <int B> inline f4 evaluate(const float* const* rows, f8 weights, const float* basis) {
     alignas(32) float w[8];
     store(w, weights);
+    keep_in_memory(w);
     f4 out{};
     for (int k = 0; k < B; ++k) {
         f16 sum = w[0] * load<f16>(rows[0] + 16 * k);

@@ -19,6 +19,9 @@ inline f16 splat16(float x) { return f16{x, x, x, x, x, x, x, x, x, x, x, x, x, 
 template <class V> inline V load(const void* p) { V v; std::memcpy(&v, p, sizeof(V)); return v; }
 template <class V> inline void store(void* p, const V& v) { std::memcpy(p, &v, sizeof(V)); }
 
+// Keeps eight numbers in memory: broadcasting from there is one load, from a register several shuffles.
+inline void keep_in_memory(float (&w)[8]) { __asm__("" : "+m"(w)); }
+
 template <class V> inline V vmin(V a, V b) { return a < b ? a : b; }
 template <class V> inline V vmax(V a, V b) { return a > b ? a : b; }
 

@@ -1,42 +1,114 @@
-// Numbers the octree's vertices in the order in which the leaves first name them, so that neighbours in space are
-// neighbours in memory. keys (n) are positions of corners; ids (n) receives the number of each; first (n) receives, for
-// each vertex, the index of the corner that named it first. Returns the number of vertices.
-#include <cstdint>
+// What follows from a set of leaves: the numbering of their corners, and where the values of new vertices come from.
+// nerfvol/octree.py has the same in numpy, used where nothing is compiled.
+#include "topology.h"
+
 #include <cstddef>
 #include <vector>
 
-#include "tree.h"
+#include "pool.h"
 
 namespace nerfvol {
+namespace {
 
-int64_t number_vertices(const int64_t* keys, int64_t n, int32_t* ids, int64_t* first) {
+uint64_t spread(uint64_t v) {  // bits of v to every third place
+    v = (v | v << 32) & 0x1F00000000FFFFull;
+    v = (v | v << 16) & 0x1F0000FF0000FFull;
+    v = (v | v << 8) & 0x100F00F00F00F00Full;
+    v = (v | v << 4) & 0x10C30C30C30C30C3ull;
+    return (v | v << 2) & 0x1249249249249249ull;
+}
+
+constexpr int kLatticeStride[3] = {9, 3, 1};
+
+// Place of a corner of a new leaf in the 3x3x3 lattice of the old leaf; octant < 0: the leaf is the old one itself.
+int lattice_place(int octant, int corner) {
+    int place = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+        const int c = corner >> (2 - axis) & 1;
+        place += kLatticeStride[axis] * (octant < 0 ? 2 * c : (octant >> (2 - axis) & 1) + c);
+    }
+    return place;
+}
+
+bool is_lattice_corner(int place) { return (place / 9) % 2 == 0 && (place / 3) % 3 % 2 == 0 && place % 3 % 2 == 0; }
+
+}  // namespace
+
+int64_t number_corners(const int64_t* level, const int64_t* ijk, int64_t n, int64_t max_level, int32_t* ids, int64_t* position) {
     int64_t capacity = 1024;
-    while (capacity < n / 2) capacity *= 2;  // a corner is shared by up to 8 leaves: grow when this guess is too small
+    while (capacity < 4 * n) capacity *= 2;  // a thin shell has about 1.3 vertices per leaf
     std::vector<int32_t> table(std::size_t(capacity), -1);
-    int64_t count = 0;
-    auto slot_of = [&](int64_t key) {
-        uint64_t h = uint64_t(key >> 6) * 0x9E3779B97F4A7C15ull;  // 4x4x4 neighbours share a cache line or two
-        return int64_t(((h >> 20) * 64 + uint64_t(key & 63)) & uint64_t(capacity - 1));
+    std::vector<uint64_t> keys;  // of the vertices so far
+    keys.reserve(std::size_t(2 * n));
+    const auto slot_of = [&](uint64_t key) {  // neighbours in space stay neighbours in the table
+        const uint64_t h = (key >> 6) * 0x9E3779B97F4A7C15ull;
+        return ((h >> 20) * 64 + (key & 63)) & uint64_t(capacity - 1);
     };
-    for (int64_t i = 0; i < n; ++i) {
-        if (2 * count >= capacity) {
-            capacity *= 2;
-            table.assign(std::size_t(capacity), -1);
-            for (int64_t v = 0; v < count; ++v) {
-                int64_t s = slot_of(keys[first[v]]);
-                while (table[std::size_t(s)] >= 0) s = (s + 1) & (capacity - 1);
-                table[std::size_t(s)] = int32_t(v);
+    for (int64_t leaf = 0; leaf < n; ++leaf) {
+        const int shift = int(max_level - level[leaf]);
+        for (int o = 0; o < 8; ++o) {
+            if (2 * int64_t(keys.size()) >= capacity) {
+                capacity *= 2;
+                table.assign(std::size_t(capacity), -1);
+                for (std::size_t v = 0; v < keys.size(); ++v) {
+                    uint64_t s = slot_of(keys[v]);
+                    while (table[s] >= 0) s = (s + 1) & uint64_t(capacity - 1);
+                    table[s] = int32_t(v);
+                }
+            }
+            uint64_t p[3];
+            for (int axis = 0; axis < 3; ++axis) p[axis] = uint64_t(ijk[3 * leaf + axis] + (o >> (2 - axis) & 1)) << shift;
+            const uint64_t key = spread(p[0]) << 2 | spread(p[1]) << 1 | spread(p[2]);
+            uint64_t s = slot_of(key);
+            while (table[s] >= 0 && keys[std::size_t(table[s])] != key) s = (s + 1) & uint64_t(capacity - 1);
+            if (table[s] < 0) {
+                table[s] = int32_t(keys.size());
+                for (int axis = 0; axis < 3; ++axis) position[3 * keys.size() + std::size_t(axis)] = int64_t(p[axis]);
+                keys.push_back(key);
+            }
+            ids[8 * leaf + o] = table[s];
+        }
+    }
+    return int64_t(keys.size());
+}
+
+void find_sources(const int32_t* corners, const int64_t* parent, const int8_t* octant, int64_t n, int64_t n_vertices,
+                  int32_t* source, int8_t* place) {
+    for (int64_t v = 0; v < n_vertices; ++v) place[v] = -1;
+    for (int64_t leaf = 0; leaf < n; ++leaf)
+        for (int o = 0; o < 8; ++o) {
+            const int32_t v = corners[8 * leaf + o];
+            const int p = lattice_place(octant[leaf], o);
+            if (place[v] < 0 || (is_lattice_corner(p) && !is_lattice_corner(place[v]))) {
+                place[v] = int8_t(p);
+                source[v] = int32_t(parent[leaf]);
             }
         }
-        int64_t s = slot_of(keys[i]);
-        while (table[std::size_t(s)] >= 0 && keys[first[table[std::size_t(s)]]] != keys[i]) s = (s + 1) & (capacity - 1);
-        if (table[std::size_t(s)] < 0) {
-            table[std::size_t(s)] = int32_t(count);
-            first[count++] = i;
+}
+
+void interpolate(const float* rows, int64_t width, const int32_t* old_corners, const int32_t* source, const int8_t* place,
+                 int64_t n_vertices, float* out) {
+    float weights[27][8];
+    for (int p = 0; p < 27; ++p)
+        for (int o = 0; o < 8; ++o) {
+            const int at[3] = {p / 9, p / 3 % 3, p % 3};
+            weights[p][o] = 1;
+            for (int axis = 0; axis < 3; ++axis)
+                weights[p][o] *= 0.5f * float((o >> (2 - axis) & 1) ? at[axis] : 2 - at[axis]);
         }
-        ids[i] = table[std::size_t(s)];
-    }
-    return count;
+    constexpr int64_t kChunk = 16384;
+    parallel_for(int((n_vertices + kChunk - 1) / kChunk), [&](int chunk, int) {
+        for (int64_t v = chunk * kChunk; v < n_vertices && v < (chunk + 1) * kChunk; ++v) {
+            float* row = out + v * width;
+            for (int64_t k = 0; k < width; ++k) row[k] = 0;
+            for (int o = 0; o < 8; ++o) {
+                const float w = weights[place[v]][o];
+                if (w == 0) continue;
+                const float* from = rows + width * old_corners[8 * int64_t(source[v]) + o];
+                for (int64_t k = 0; k < width; ++k) row[k] += w * from[k];
+            }
+        }
+    });
 }
 
 }  // namespace nerfvol

@@ -24,13 +24,25 @@ using nerfvol::StepReport;
 
 // What phase 1 leaves of one packet. Kept between steps to spare the allocations.
 struct PacketRecord {
-    std::vector<Hit> hits;
+    std::unique_ptr<Hit[]> hits;
+    size_t n_hits = 0, capacity = 0;
     std::vector<Visit> visits;
     std::vector<int32_t> first_hit;       // of each visit
     std::vector<int32_t> order;           // visits grouped by bucket (a visit that straddles stands in several groups)
     int32_t offset[kBuckets + 1];
-    alignas(64) float basis[kTile][64];   // rows of BasisRows, 16 * B used
+    alignas(64) float basis[kTile * 64];  // rows of BasisRows, 16 * B floats each
     StepReport report;
+
+    Hit* append(size_t n) {
+        if (n_hits + n > capacity) {
+            capacity = std::max<size_t>(1024, 2 * (n_hits + n));
+            std::unique_ptr<Hit[]> larger(new Hit[capacity]);
+            std::copy(hits.get(), hits.get() + n_hits, larger.get());
+            hits = std::move(larger);
+        }
+        n_hits += n;
+        return hits.get() + n_hits - n;
+    }
 };
 
 inline int bucket_shift(int64_t n_vertices) {
@@ -42,15 +54,14 @@ inline int bucket_shift(int64_t n_vertices) {
 template <int B>
 void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, PacketRecord& rec) {
     Extinction x;
-    rec.hits.clear();
+    rec.n_hits = 0;
     rec.visits.clear();
     rec.first_hit.clear();
     start(state);
     march<B>(tree, p, basis, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const float* const* rows, const BasisRows<B>& b) {
         const int m = __builtin_popcountll(hits);
-        const size_t base = rec.hits.size();
-        rec.hits.resize(base + size_t(m));
-        Hit* h = rec.hits.data() + base;
+        const size_t base = rec.n_hits;
+        Hit* h = rec.append(size_t(m));
         int i = 0;
         for (uint64_t rest = hits; rest; rest &= rest - 1, ++i) {
             const int l = __builtin_ctzll(rest);
@@ -139,7 +150,7 @@ inline void backward_packet(PacketRecord& rec, Adjoint& a, float per_length) {
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
     for (size_t v = rec.visits.size(); v-- > 0;) {
         Visit& visit = rec.visits[v];
-        Hit* h = rec.hits.data() + rec.first_hit[v];
+        Hit* h = rec.hits.get() + rec.first_hit[v];
         for (int i = 0; i < visit.n_hits; ++i) {
             const int l = h[i].lane;
             const float w = h[i].weight;
@@ -216,16 +227,17 @@ template <int B> struct Sums {
 
 template <int B> void add_visit(const Tree& tree, const PacketRecord& rec, int v, int bucket, int shift, int32_t* slots, Sums<B>& sums) {
     const Visit& visit = rec.visits[size_t(v)];
-    const Hit* h = rec.hits.data() + rec.first_hit[size_t(v)];
+    const Hit* h = rec.hits.get() + rec.first_hit[size_t(v)];
     f16 corner[8][B];
     for (int o = 0; o < 8; ++o)
         for (int k = 0; k < B; ++k) corner[o][k] = f16{};
     for (int i = 0; i < visit.n_hits; ++i) {
         alignas(32) float w[8];
         store(w, trilinear(h[i].fx, h[i].fy, h[i].fz));
+        keep_in_memory(w);
         const f4 v4 = h[i].value;
         const f16 g = __builtin_shufflevector(v4, v4, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
-        const float* basis = rec.basis[h[i].lane];
+        const float* basis = rec.basis + 16 * B * h[i].lane;
         for (int k = 0; k < B; ++k) {
             f16 b = load<f16>(basis + 16 * k);
             f16 gk = g;
@@ -323,11 +335,11 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         if (loss) bound_packet(p);
         BasisRows<B> basis;
         basis.fill(p, tree.sh_degree);
-        for (int l = 0; l < count; ++l) std::memcpy(rec.basis[l], basis.row[l], sizeof(basis.row[l]));
+        for (int l = 0; l < count; ++l) std::memcpy(rec.basis + 16 * B * l, basis.row[l], sizeof(basis.row[l]));
         PacketState state;
         forward_packet<B>(tree, p, basis, options.early_stop_eps, state, rec);
         Adjoint adjoint;
-        rec.report = {0, 0, double(rec.hits.size())};
+        rec.report = {0, 0, double(rec.n_hits)};
         if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
         else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
         backward_packet(rec, adjoint, 1.0f / tree.size);
@@ -341,6 +353,11 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
             for (int32_t k = rec.offset[bucket]; k < rec.offset[bucket + 1]; ++k) {
                 const int v = rec.order[size_t(k)];
                 const Visit& visit = rec.visits[size_t(v)];
+                if (k + 4 < rec.offset[bucket + 1]) {  // records lie scattered: ask for the ones to come
+                    const size_t next = size_t(rec.order[size_t(k) + 4]);
+                    __builtin_prefetch(rec.hits.get() + rec.first_hit[next]);
+                    __builtin_prefetch(tree.corners + 8 * int64_t(rec.visits[next].leaf));
+                }
                 add_visit<B>(tree, rec, v, bucket, shift, sink.slots, sums);
                 if (statistics.max_weight && tree.corners[8 * int64_t(visit.leaf)] >> shift == bucket)
                     add_statistics(rec, visit, statistics, pixel_angle);

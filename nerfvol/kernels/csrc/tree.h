@@ -82,6 +82,4 @@ const char* isa_name();
 bool set_isa(const char* name);                  // "auto" or a name from available_isas(); false if this CPU lacks it
 int available_isas(const char** names);          // fills up to 3 names, best first
 
-int64_t number_vertices(const int64_t* keys, int64_t n, int32_t* ids, int64_t* first);
-
 }  // namespace nerfvol

@@ -1,0 +1,197 @@
+"""Optimising the octree: stages from coarse to fine, pruning, subdivision where it pays.
+
+The recipe (docs/performance.md has what each choice is worth): images from small to full size, an octree that starts
+thin and uniform, loses what no ray needs and splits what rays see at more than a pixel; per-sample colour and distortion
+terms that empty space; RMSprop on touched vertices.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nerfvol.datasets import Dataset, SceneBounds
+from nerfvol.errors import InputError
+from nerfvol.kernels import ops
+from nerfvol.octree import Octree
+from nerfvol.tiles import Cursor, TileBank
+
+
+@dataclass
+class OctreeConfig:
+    """Settings of the octree's optimisation. Shares of progress lie in [0, 1]."""
+
+    steps: int = 14000
+    """Optimiser steps of the whole schedule when no time budget is given."""
+    levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9])
+    """Finest level of each stage: level 8 means 256 cells along the region of detail."""
+    downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1])
+    """Image downscale of each stage."""
+    until: list[float] = field(default_factory=lambda: [0.005, 0.01, 0.03, 0.10, 0.35, 1.0])
+    """Share of progress at which each stage ends."""
+    tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 256, 256, 512])
+    """8x8 tiles in a batch, per stage."""
+    prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 1, 1, 2])
+    """Prunings inside each stage, evenly spaced."""
+    coverage: float = 0.5
+    sh_degree: int = 1
+    rich_share: float = 0.8
+    """Share of a batch drawn from tiles that are not plain background."""
+    colour: float = 0.03
+    """Weight of the per-sample colour term at the start."""
+    distortion: float = 0.01
+    """Weight of the distortion term at the start."""
+    regulariser_decay: float = 0.1
+    """Both weights shrink to this factor over the run."""
+    rate_density: float = 0.3
+    rate_dc: float = 0.07
+    rate_sh: float = 0.006
+    rate_decay: float = 0.02
+    """Learning rates shrink exponentially to this factor ..."""
+    decay_from: float = 0.35
+    """... from this share of progress on."""
+    beta: float = 0.98
+    prune_weight: float = 0.005
+    """Leaves whose largest rendering weight since the last pruning is below are removed."""
+    subdivide_pixels: float = 1.0
+    """Leaves are split only while they are larger than this many pixels in some view."""
+    early_stop_eps: float = 1e-3
+
+
+class OctreeTrainer:
+    """Optimises an octree on a dataset. ``progress`` runs from 0 to 1 and drives every schedule."""
+
+    def __init__(self, dataset: Dataset, background: Sequence[float], config: OctreeConfig, seed: int, octree: Octree | None):
+        n = len(config.levels)
+        for name in ("downscales", "until", "tiles", "prunes"):
+            if len(getattr(config, name)) != n:
+                raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
+        self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
+        self.octree = octree if octree is not None else thin_octree(dataset.scene, config.levels[0], config.sh_degree)
+        self.state = ops.TrainState(self.octree)
+        # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
+        self.stage = 0 if octree is None else first_stage(config, octree)
+        self.first_stage = self.stage
+        self.step_count = 0
+        self.rich, self.plain = Cursor(), Cursor()
+        self.prunings = 0
+        self.tiles_seen = 0
+        self.bank: TileBank | None = None
+
+    @property
+    def _start(self) -> float:
+        """The share of the schedule that a given octree skips."""
+        return self.config.until[self.first_stage - 1] if self.first_stage else 0.0
+
+    def state_dict(self) -> dict:
+        """Everything an exact continuation needs: arrays, numbers and strings."""
+        t, s = self.octree, self.state
+        return {
+            "node_mask": t.node_mask, "leaf_mask": t.leaf_mask, "values": t.values, "moments": s.moments,
+            "origin": t.origin, "size": t.size, "density_scale": t.density_scale, "sh_degree": t.sh_degree,
+            "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
+            "stage": self.stage, "first_stage": self.first_stage, "step_count": self.step_count,
+            "prunings": self.prunings, "tiles_seen": self.tiles_seen,
+            "rich": dataclasses.asdict(self.rich), "plain": dataclasses.asdict(self.plain),
+        }  # fmt: skip
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continues from :meth:`state_dict` as if nothing had happened."""
+        octree = Octree(
+            state["node_mask"], state["leaf_mask"], origin=state["origin"], size=state["size"],
+            sh_degree=state["sh_degree"], density_scale=state["density_scale"],
+        )  # fmt: skip
+        if np.shape(state["values"]) != octree.values.shape or np.shape(state["moments"]) != octree.values.shape:
+            raise InputError("checkpoint: values and moments do not fit the octree's topology")
+        octree.values = np.array(state["values"], dtype=np.float32)
+        self.octree = octree
+        self.state = ops.TrainState(octree, np.array(state["moments"], dtype=np.float32))
+        for name in ("max_weight", "error", "footprint"):
+            if np.shape(state[name]) != (octree.n_leaves,):
+                raise InputError(f"checkpoint: {name} does not fit the octree's {octree.n_leaves} leaves")
+            setattr(self.state, name, np.array(state[name], dtype=np.float32))
+        for name in ("stage", "first_stage", "step_count", "prunings", "tiles_seen"):
+            setattr(self, name, int(state[name]))
+        self.rich, self.plain = Cursor(**state["rich"]), Cursor(**state["plain"])
+        self.bank = None
+
+    def step(self, progress: float) -> ops.StepReport:
+        """One step at ``progress`` in [0, 1] of the run."""
+        c = self.config
+        progress = self._start + progress * (1 - self._start)
+        if progress >= c.until[self.stage] and self.stage + 1 < len(c.levels):
+            if self.prunings == c.prunes[self.stage] and self._seen_enough():
+                self.next_stage()
+        self._prune_inside_stage(progress)
+        if self.bank is None:
+            self.bank = TileBank(self.dataset, self.background, c.downscales[self.stage])
+        fade = c.regulariser_decay**progress
+        options = ops.LossOptions(self.background, c.colour * fade, c.distortion * fade, c.early_stop_eps)
+        late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
+        rate = c.rate_decay**late
+        rates = ops.Rates(c.rate_density * rate, c.rate_dc * rate, c.rate_sh * rate, c.beta)
+        batch = self.bank.draw(c.tiles[self.stage], c.rich_share, self.seed, self.rich, self.plain)
+        report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
+        self.step_count += 1
+        self.tiles_seen += c.tiles[self.stage]
+        return report
+
+    def next_stage(self) -> None:
+        c = self.config
+        old, self.stage, self.prunings = self.stage, self.stage + 1, 0
+        self.prune()
+        while self.octree.max_level < c.levels[self.stage]:
+            split = (self.octree.leaf_level < c.levels[self.stage])
+            if c.levels[self.stage] > 8:
+                ratio = c.downscales[old] / c.downscales[self.stage]
+                split &= self.footprint * ratio > c.subdivide_pixels
+            self._change(*self.octree.subdivide(split))
+        if c.downscales[old] != c.downscales[self.stage]:
+            self.bank = None
+            self.rich, self.plain = Cursor(), Cursor()
+
+    def _seen_enough(self) -> bool:
+        """Whether the rays since the last pruning can tell what no ray needs."""
+        c = self.config
+        return self.bank is not None and self.tiles_seen >= min(c.coverage * len(self.bank.rich_tiles), 20000)
+
+    def _prune_inside_stage(self, progress: float) -> None:
+        c = self.config
+        start = c.until[self.stage - 1] if self.stage else 0.0
+        due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
+        if self.prunings < c.prunes[self.stage] and progress >= start + due * (c.until[self.stage] - start) and self._seen_enough():
+            self.prune()
+            self.prunings += 1
+
+    def prune(self) -> None:
+        self.tiles_seen = 0
+        keep = self.state.max_weight >= self.config.prune_weight
+        self.footprint = self.state.footprint[keep]
+        self._change(*self.octree.prune(keep))
+
+    def _change(self, octree: Octree, transfer) -> None:
+        moments = transfer.vertices(self.state.moments)
+        footprint = getattr(self, "footprint", None)
+        self.octree = octree
+        self.state = ops.TrainState(octree, moments)
+        if footprint is not None and transfer.parent is not None and len(footprint) != octree.n_leaves:
+            self.footprint = footprint[transfer.parent] / 2
+
+
+def first_stage(config: OctreeConfig, octree: Octree) -> int:
+    """The first stage whose finest level is the octree's, or the last one."""
+    reached = [i for i, level in enumerate(config.levels) if level >= octree.max_level]
+    return reached[0] if reached else len(config.levels) - 1
+
+
+def thin_octree(scene: SceneBounds, level: int, sh_degree: int) -> Octree:
+    """A uniform, nearly transparent octree over the region of detail."""
+    lo, hi = scene.aabb
+    size = float((hi - lo).max())
+    n = 2**level
+    ijk = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    origin = (lo + hi) / 2 - size / 2
+    return Octree.from_leaves(np.full(len(ijk), level), ijk, origin, size, sh_degree, density_scale=300 / size)
