@@ -7,7 +7,7 @@ import ast
 import sys
 import time
 
-from data_synth import scenes
+from data_synth import integrators, scenes
 from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError
 
@@ -25,7 +25,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, default=0, help="seed of camera places and of Monte Carlo (default 0)")
     p.add_argument("--integrator", metavar="NAME", help="how to render; by default the scene's own choice")
     p.add_argument("--spp", type=int, metavar="N", help="samples per pixel of Monte Carlo integrators")
-    p.add_argument("--light", metavar="NAME,...", help="lights by name instead of the scene's own")
+    lights = ", ".join(scenes.LIGHTS)
+    p.add_argument("--light", metavar="NAME,...", help=f"lights instead of the scene's own: {lights}")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a parameter of the scene")
     p.add_argument("--volume", metavar="FILE", help="a density volume (.vdb or .npz) for scenes that take one")
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
@@ -43,8 +44,8 @@ def main(argv: list[str]) -> int:
 
 
 def _list() -> int:
-    for name, factory in scenes.SCENES.items():
-        print(f"{name:14s} {factory.summary}  [docs/gallery/{name}.jpg]")
+    for name in scenes.SCENES:
+        print(f"{name:14s} {scenes.summary(name)}  [docs/gallery/{name}.jpg]")
     return 0
 
 
@@ -78,10 +79,13 @@ def _render(args) -> int:
     started = time.perf_counter()
     size = _size(args.size)
     scene = scenes.make(args.scene, **_parameters(args))
-    integrator = None
+    name = args.integrator or scene.integrators[0]
     if args.integrator and args.integrator not in scene.integrators:
         known = ", ".join(scene.integrators)
         raise InputError(f"--integrator: scene {scene.name} takes {known}, got {args.integrator}")
+    if args.spp is not None and name != "path":
+        raise InputError(f"--spp: only the path integrator has samples, {scene.name} is rendered by {name}")
+    integrator = None if args.scene == "showcase" else integrators.make(name, spp=args.spp)
 
     def progress(done: int, total: int) -> None:
         if sys.stderr.isatty():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import platform
 import time
@@ -12,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-import data_synth
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.image import Picture, replacing, write_exr, write_png
@@ -77,7 +77,8 @@ def write_dataset(scene, out_dir, options: Options | None = None) -> Path:
             for k, camera in enumerate(cameras):
                 view_seed = (options.seed * 1_000_003 + done) & 0x7FFFFFFF
                 picture = render_view(scene, camera, options.integrator, view_seed)
-                written.append(writer.submit(_write_picture, picture, out_dir / split / f"r_{k}", options.exr))
+                stem = out_dir / split / f"r_{k}"
+                written.append(writer.submit(_write_picture, picture, stem, scene.exposure, options.exr))
                 done += 1
                 if options.progress:
                     options.progress(done, total)
@@ -91,8 +92,8 @@ def write_dataset(scene, out_dir, options: Options | None = None) -> Path:
     return out_dir
 
 
-def _write_picture(picture: Picture, stem: Path, exr: bool) -> None:
-    write_png(stem.with_suffix(".png"), picture.rgba8())
+def _write_picture(picture: Picture, stem: Path, exposure: float, exr: bool) -> None:
+    write_png(stem.with_suffix(".png"), picture.rgba8(exposure))
     if exr:
         write_exr(stem.with_suffix(".exr"), exr_channels(picture))
 
@@ -126,7 +127,7 @@ def _provenance(scene, options: Options, seconds: float) -> dict:
         "seed": options.seed,
         "seconds": round(seconds, 3),
         "versions": {
-            "data_synth": data_synth.__version__,
+            "data_synth": importlib.import_module("data_synth").__version__,
             "numpy": np.__version__,
             "numba": numba.__version__,
             "python": platform.python_version(),

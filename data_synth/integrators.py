@@ -21,6 +21,7 @@ from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.image import Picture
 from data_synth.jit import in_bands
+from data_synth.rng import new_rng
 from data_synth.scene import Scene
 
 
@@ -40,7 +41,7 @@ class March:
         out, data = np.empty((camera.height, camera.width, 5)), camera.data()
         in_bands(
             lambda first, last: march.render_rows(
-                world, backdrop, maps, self.mode, data, self.side, scene.opaque_sky, out, first, last
+                world, backdrop, maps, self.mode, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last
             ),
             camera.height,
             4,
@@ -93,9 +94,11 @@ class Path:
         world, _, _ = _prepared(self, scene)
         out, data = np.empty((camera.height, camera.width, 8)), camera.data()
         settings = path.Settings(self.spp, self.max_depth, self.jitter, scene.opaque_sky, seed)
-        in_bands(
-            lambda first, last: path.render_rows(world, data, settings, out, first, last), camera.height, 2
-        )
+
+        def rows(first: int, last: int) -> None:
+            path.render_rows(world, data, settings, new_rng(0, 0), out, first, last)
+
+        in_bands(rows, camera.height, 2)
         return Picture(out[..., :3], out[..., 3], out[..., 4], out[..., 5:8], self.spp)
 
 

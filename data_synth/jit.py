@@ -17,7 +17,10 @@ from pathlib import Path
 import numba
 
 # error_model="numpy": x/0 is inf as in IEEE 754, no exception branch behind every division.
-jit = numba.njit(nogil=True, error_model="numpy")
+# _nrt=False: no array is ever made inside compiled code, so none needs its references counted. Counting them, with
+# atomic operations at every call that passes a scene along, took most of the time.
+OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
+jit = numba.njit(**OPTIONS)
 
 
 def _sources_stamp() -> tuple[float, int]:
@@ -35,7 +38,7 @@ def kernel(function: Callable) -> Callable:
     Numba itself compares only the file the function stands in, and would go on using code into which it has inlined
     a function of another, since edited file.
     """
-    compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
+    compiled = numba.njit(cache=True, **OPTIONS)(function)
     index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if hasattr(index, "_source_stamp"):
         index._source_stamp = _STAMP

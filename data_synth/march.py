@@ -15,7 +15,7 @@ from data_synth.jit import jit, kernel
 from data_synth.lights import escaped, sample_light
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE
 from data_synth.media import attribute, box_interval, extinction, lookup
-from data_synth.rng import new_rng, reseed
+from data_synth.rng import reseed
 from data_synth.scene import blocked, inside_medium, next_surface, visible
 from data_synth.shadowmap import look_up
 from data_synth.spongecake import attenuation
@@ -163,12 +163,11 @@ def bend(n, wo, ior, inside):
 
 
 @kernel
-def render_rows(w, backdrop, maps, mode, camera, side, opaque_sky, out, first, last):
+def render_rows(w, backdrop, maps, mode, camera, side, opaque_sky, rng, out, first, last):
     """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance; side x side rays per pixel on a regular grid.
 
     backdrop: the light table whose sky is seen behind everything if opaque_sky.
     """
-    rng = new_rng(0, 0)
     o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
     for j in range(first, last):
         for i in range(out.shape[1]):

@@ -146,7 +146,7 @@ def _medium(kind, lo, hi, cells, bounds, sigma_t, albedo, Le, phase) -> Medium:
     phase = phase or phases.isotropic()
     area = math.sqrt(max(np.linalg.eigvalsh(_matrix(s))[-1] for s in phase.S))
     cell = tuple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
-    step = 0.5 * min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
+    step = min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
     return Medium(
         kind, lo, hi, cells, tuple(-(-n // BRICK) for n in cells) if kind == GRID else cells, cell,
         np.zeros(1, np.int64), np.zeros(1, np.float32), np.zeros(1, np.float32),

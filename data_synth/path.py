@@ -16,7 +16,7 @@ from data_synth.jit import jit, kernel
 from data_synth.lights import column3, escaped, quad_pdf, sample_light
 from data_synth.materials import DIELECTRIC, NULL
 from data_synth.media import attribute, box_interval, extinction, lookup
-from data_synth.rng import new_rng, reseed, uniform
+from data_synth.rng import reseed, uniform
 from data_synth.scene import inside_medium, next_surface, visible
 from data_synth.traverse import collisions, traversal
 from data_synth.vec import add, along, dot, largest, mul, neg, scale, sub
@@ -158,9 +158,8 @@ def trace_path(w, ray, settings, rng):
 
 
 @kernel
-def render_rows(w, camera, settings, out, first, last):
+def render_rows(w, camera, settings, rng, out, first, last):
     """Rows first..last - 1 of out (H, W, 8) = rgb, alpha, distance, variance of the mean rgb."""
-    rng = new_rng(0, 0)
     o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
     n = settings.spp
     for j in range(first, last):

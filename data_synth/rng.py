@@ -23,10 +23,10 @@ def reseed(rng, seed, stream):
     rng[0] = mix(mix(np.uint64(seed) + np.uint64(0x632BE59BD9B4E019)) + np.uint64(stream))
 
 
-@jit
-def new_rng(seed, stream):
-    rng = np.empty(1, np.uint64)
-    reseed(rng, seed, stream)
+def new_rng(seed: int, stream: int) -> np.ndarray:
+    """A stream to hand to a kernel."""
+    rng = np.zeros(1, np.uint64)
+    rng[0] = np.uint64((seed * 0x9E3779B97F4A7C15 + stream * 0xBF58476D1CE4E5B9 + 0x94D049BB133111EB) % 2**64)
     return rng
 
 

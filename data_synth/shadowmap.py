@@ -1,7 +1,7 @@
-"""Deep shadow maps [DSM, Tessendorf], PHYSICS 8: a grid of RGB transmittance towards each light, read trilinearly.
+"""Deep shadow maps [DSM, Tessendorf], PHYSICS 8: grids of RGB transmittance to each light, read trilinearly.
 
-A map covers the medium's box at a resolution of its own and stays valid for every camera. Surfaces count: behind one the
-transmittance is 0, which is what makes shafts of light. Three ways to fill it:
+A map covers the medium's box at a resolution of its own and stays valid for every camera. Surfaces count: behind one
+the transmittance is 0, which is what makes shafts of light. Three ways to fill it:
     sweep   directional lights: the grid is turned so that one axis points at the light; each sample takes the
             transmittance of its neighbour nearer to the light times that of the one cell in between
     eager   every sample marches to the light
@@ -21,7 +21,7 @@ from data_synth.jit import in_bands, jit, kernel
 from data_synth.lights import DIRECTIONAL, sample_light
 from data_synth.rng import new_rng
 from data_synth.scene import World, inside_medium, visible
-from data_synth.vec import frame, scale
+from data_synth.vec import frame
 
 
 class ShadowMaps(NamedTuple):
@@ -67,7 +67,7 @@ def build(w: World, resolution: int, fill: str = "sweep") -> ShadowMaps:
     if fill != "lazy":
         for k in range(len(w.lights)):
             swept = fill == "sweep" and w.lights[k, 0] == DIRECTIONAL and not w.bounded
-            in_bands(lambda a, b, k=k, swept=swept: _fill(maps, w, k, swept, a, b), int(shape[k, 0]), 2)
+            in_bands(lambda a, b, k=k, swept=swept: _fill(maps, w, k, swept, new_rng(0, 0), a, b), int(shape[k, 0]), 2)
     return maps
 
 
@@ -111,9 +111,8 @@ def towards_light(maps, w, k, i, j, h, rng):
 
 
 @kernel
-def _fill(maps, w, k, swept, first, last):
-    """Samples with first number first..last - 1 of map k."""
-    rng = new_rng(0, 0)
+def _fill(maps, w, k, swept, rng, first, last):
+    """Samples with first number first..last - 1 of map k. rng: marching draws nothing from it."""
     n, a = maps.shape[k], maps.to_world[k]
     cell = math.sqrt(a[0, 2] ** 2 + a[1, 2] ** 2 + a[2, 2] ** 2)
     for i in range(first, last):
@@ -131,30 +130,46 @@ def _fill(maps, w, k, swept, first, last):
 
 
 @jit
-def fetch(maps, w, k, at, i, j, h, rng):
-    """One stored sample as RGB; a lazy map fills it now."""
-    if maps.values[at] != maps.values[at]:
-        store(maps, at, towards_light(maps, w, k, i, j, h, rng))
-    v = maps.values
-    if maps.channels == 1:
-        return (float(v[at]), float(v[at]), float(v[at]))
-    return (float(v[at]), float(v[at + 1]), float(v[at + 2]))
+def blend(v, at, stride_i, stride_j, stride_h, fu, fv, fw):
+    """Trilinear mixture of eight stored numbers; NaN as long as any of them is missing."""
+    e, f = at + stride_i, at + stride_j
+    g = e + stride_j
+    low = (v[at] * (1.0 - fw) + v[at + stride_h] * fw) * (1.0 - fv) + (v[f] * (1.0 - fw) + v[f + stride_h] * fw) * fv
+    high = (v[e] * (1.0 - fw) + v[e + stride_h] * fw) * (1.0 - fv) + (v[g] * (1.0 - fw) + v[g + stride_h] * fw) * fv
+    return low * (1.0 - fu) + high * fu
+
+
+@jit
+def fill_corners(maps, w, k, i, j, h, rng):
+    """Compute the samples that a lazy map still lacks around a lookup."""
+    n = maps.shape
+    for corner in range(8):
+        a, b, c = i + (corner >> 2), j + (corner >> 1 & 1), h + (corner & 1)
+        at = maps.first[k] + ((a * n[k, 1] + b) * n[k, 2] + c) * maps.channels
+        if maps.values[at] != maps.values[at]:
+            store(maps, at, towards_light(maps, w, k, a, b, c, rng))
 
 
 @jit
 def look_up(maps, w, k, p, rng):
     """RGB transmittance from p to light k: trilinear, clamped to the map's box."""
-    n = maps.shape[k]
-    q = apply(maps.to_grid[k], p)
-    i = min(max(int(q[0]), 0), n[0] - 2)
-    j = min(max(int(q[1]), 0), n[1] - 2)
-    h = min(max(int(q[2]), 0), n[2] - 2)
-    fu, fv, fw = min(max(q[0] - i, 0.0), 1.0), min(max(q[1] - j, 0.0), 1.0), min(max(q[2] - h, 0.0), 1.0)
-    total = (0.0, 0.0, 0.0)
-    for corner in range(8):
-        a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
-        weight = (fu if a else 1.0 - fu) * (fv if b else 1.0 - fv) * (fw if c else 1.0 - fw)
-        at = maps.first[k] + (((i + a) * n[1] + j + b) * n[2] + h + c) * maps.channels
-        value = scale(weight, fetch(maps, w, k, at, i + a, j + b, h + c, rng))
-        total = (total[0] + value[0], total[1] + value[1], total[2] + value[2])
-    return total
+    n, a = maps.shape, maps.to_grid
+    x = a[k, 0, 0] * p[0] + a[k, 0, 1] * p[1] + a[k, 0, 2] * p[2] + a[k, 0, 3]
+    y = a[k, 1, 0] * p[0] + a[k, 1, 1] * p[1] + a[k, 1, 2] * p[2] + a[k, 1, 3]
+    z = a[k, 2, 0] * p[0] + a[k, 2, 1] * p[1] + a[k, 2, 2] * p[2] + a[k, 2, 3]
+    i = min(max(int(x), 0), n[k, 0] - 2)
+    j = min(max(int(y), 0), n[k, 1] - 2)
+    h = min(max(int(z), 0), n[k, 2] - 2)
+    fu, fv, fw = min(max(x - i, 0.0), 1.0), min(max(y - j, 0.0), 1.0), min(max(z - h, 0.0), 1.0)
+    stride = maps.channels
+    sj = n[k, 2] * stride
+    si = n[k, 1] * sj
+    at = maps.first[k] + i * si + j * sj + h * stride
+    red = blend(maps.values, at, si, sj, stride, fu, fv, fw)
+    if red != red:
+        fill_corners(maps, w, k, i, j, h, rng)
+        red = blend(maps.values, at, si, sj, stride, fu, fv, fw)
+    if stride == 1:
+        return (red, red, red)
+    green = blend(maps.values, at + 1, si, sj, stride, fu, fv, fw)
+    return (red, green, blend(maps.values, at + 2, si, sj, stride, fu, fv, fw))

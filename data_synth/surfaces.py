@@ -22,7 +22,8 @@ LEAF = 4
 
 
 class Geometry(NamedTuple):
-    """All surfaces. bvh: (nodes, 8) lo, hi, second child or first triangle, number of triangles (0 inside)."""
+    """All surfaces. bvh: (nodes, 9) in depth-first order: lo, hi, first triangle, number of triangles (0 for inner
+    nodes), and the node that follows when this one and all below it are done."""
 
     shapes: np.ndarray
     triangles: np.ndarray
@@ -70,25 +71,26 @@ def geometry(shapes=(), triangles=None) -> Geometry:
     """Collect shapes, and triangles in a hierarchy (median split along the longest side)."""
     table = np.array(shapes, float).reshape(-1, 12)
     if triangles is None or len(triangles) == 0:
-        return Geometry(table, np.zeros((0, 12)), np.zeros((0, 8)))
+        return Geometry(table, np.zeros((0, 12)), np.zeros((0, 9)))
     corners = triangles[:, None, 1:4] + np.stack(
         [np.zeros_like(triangles[:, 1:4]), triangles[:, 4:7], triangles[:, 7:10]], axis=1
     )
     lo, hi = corners.min(axis=1), corners.max(axis=1)
     order, nodes = np.arange(len(triangles)), []
 
-    def build(first: int, last: int) -> int:
+    def build(first: int, last: int) -> None:
         part = order[first:last]
         index = len(nodes)
         low, high = lo[part].min(axis=0), hi[part].max(axis=0)
-        nodes.append([*low, *high, first, last - first])
+        nodes.append([*low, *high, first, last - first, 0])
         if last - first > LEAF:
+            nodes[index][7] = 0
             axis = int(np.argmax(high - low))
             middle = (last - first) // 2
             order[first:last] = part[np.argsort((lo + hi)[part, axis], kind="stable")]
-            build(first, first + middle)  # the first child follows its parent
-            nodes[index][6:] = [build(first + middle, last), 0]
-        return index
+            build(first, first + middle)
+            build(first + middle, last)
+        nodes[index][8] = len(nodes)
 
     build(0, len(order))
     return Geometry(table, np.ascontiguousarray(triangles[order]), np.array(nodes, float))
@@ -194,22 +196,16 @@ def intersect(g, ray, t_max):
 @jit
 def hit_mesh(g, ray, t_max):
     """(t, triangle) of the nearest triangle through the hierarchy, triangle -1 if there is none."""
-    stack = np.empty(64, np.int64)
-    stack[0], depth = 0, 1
-    best, which = t_max, -1
-    while depth > 0:
-        depth -= 1
-        node = g.bvh[stack[depth]]
+    index, best, which = 0, t_max, -1
+    while index < g.bvh.shape[0]:
+        node = g.bvh[index]
         t0, t1 = box_roots(ray, (node[0], node[1], node[2]), (node[3], node[4], node[5]))
         if t0 > t1 or t1 < 0.0 or t0 > best:
+            index = int(node[8])
             continue
-        if node[7] > 0.0:
-            for k in range(int(node[6]), int(node[6] + node[7])):
-                t = hit_triangle(g.triangles[k], ray, best)
-                if t < best:
-                    best, which = t, k
-        else:
-            stack[depth + 1] = stack[depth] + 1
-            stack[depth] = int(node[6])
-            depth += 2
+        for k in range(int(node[6]), int(node[6] + node[7])):
+            t = hit_triangle(g.triangles[k], ray, best)
+            if t < best:
+                best, which = t, k
+        index += 1
     return best, which

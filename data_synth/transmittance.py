@@ -191,15 +191,13 @@ def free_flight(m, ray, t0, t1, method, local, rng):
 
 
 @kernel
-def _transmittances(m, ray, t1, method, local, seed, out):
-    rng = new_rng(seed, 0)
+def _transmittances(m, ray, t1, method, local, rng, out):
     for k in range(out.shape[0]):
         out[k, 0], out[k, 1], out[k, 2] = transmittance(m, ray, 0.0, t1, method, local, rng)
 
 
 @kernel
-def _flights(m, ray, t1, method, local, seed, out):
-    rng = new_rng(seed, 0)
+def _flights(m, ray, t1, method, local, rng, out):
     for k in range(out.shape[0]):
         out[k] = free_flight(m, ray, 0.0, t1, method, local, rng)
 
@@ -210,14 +208,14 @@ def sample_transmittance(m: Medium, o, d, t1=np.inf, method="ratio", local=True,
     method: a row of the table above. local: one majorant per brick instead of one for all.
     """
     out = np.empty((n, 3))
-    _transmittances(m, _ray(o, d), float(t1), _method(m, method, METHODS), bool(local), seed, out)
+    _transmittances(m, _ray(o, d), float(t1), _method(m, method, METHODS), bool(local), new_rng(seed, 0), out)
     return out
 
 
 def sample_flights(m: Medium, o, d, t1=np.inf, method="woodcock", local=True, n=1, seed=0) -> np.ndarray:
     """(n,) independent free-flight distances from o along unit d, inf for those that leave or reach t1."""
     out = np.empty(n)
-    _flights(m, _ray(o, d), float(t1), _method(m, method, DISTANCE_METHODS), bool(local), seed, out)
+    _flights(m, _ray(o, d), float(t1), _method(m, method, DISTANCE_METHODS), bool(local), new_rng(seed, 0), out)
     return out
 
 

@@ -212,6 +212,7 @@ class Showcase:
     viewpoints = Viewpoints(target=(0.0, 0.0, -0.2), radius=4.0, elevation=(8.0, 75.0), fov=40.0)
     aabb = np.array([[-1.35, -1.35, -0.7], [1.35, 1.35, 0.7]])
     integrators = ("emission",)
+    exposure = 1.0
 
     def __init__(self, haze: float = 4.5, steps: int = 96, smooth: int = 2) -> None:
         self.haze = Haze(sigma=float(haze), radius=0.62, width=0.13, height=0.28, steps=int(steps))

@@ -1,0 +1,171 @@
+"""Scenes whose answer is known in closed form, and scenes of one idea each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_synth import lights, materials, media, phase, spongecake, surfaces
+from data_synth import sggx as flakes
+from data_synth.cameras import Viewpoints
+from data_synth.scene import Scene
+
+
+def slab(sigma: float = 1.2, height: float = 0.6) -> Scene:
+    """homogeneous glowing slab: T = exp(-sigma length), L = (1 - T) Le"""
+    medium = media.homogeneous((-1, -1, -height / 2), (1, 1, height / 2), (sigma, 0.8 * sigma, 0.5 * sigma))
+    return Scene(
+        medium=medium._replace(Le=np.array([[0.9, 0.55, 0.25]])),
+        viewpoints=Viewpoints(radius=4.2, elevation=(5, 60)),
+        integrators=("emission", "path"),
+        aabb=np.array([[-1.05, -1.05, -height], [1.05, 1.05, height]]),
+    )
+
+
+def sphere(sigma: float = 1.6, radius: float = 1.0) -> Scene:
+    """homogeneous glowing sphere: T = exp(-sigma chord)"""
+    r = radius
+    medium = media.homogeneous((-r,) * 3, (r,) * 3, (0.5 * sigma, 0.8 * sigma, sigma), Le=(0.25, 0.55, 0.95))
+    return Scene(
+        medium=medium,
+        shapes=[surfaces.sphere(0, (0, 0, 0), r)],
+        materials=[materials.null()],
+        bounded=True,
+        viewpoints=Viewpoints(radius=4.2, elevation=(-30, 60)),
+        integrators=("emission", "path"),
+        aabb=np.array([[-1.05 * r] * 3, [1.05 * r] * 3]),
+    )
+
+
+def solids() -> Scene:
+    """glossy sphere, box and a faceted gem under a sun and a sky, no medium"""
+    return Scene(
+        shapes=_stage(),
+        triangles=_gem(4, (0.75, -0.55, -0.28), 0.42),
+        materials=_stage_materials(),
+        lights=[lights.directional((0.5, -0.7, 1.0), (2.6, 2.4, 2.1)), lights.sky((0.25, 0.45, 0.9), 0.7, 0.15)],
+        viewpoints=Viewpoints(target=(0, 0, -0.3), radius=4.2, elevation=(12, 70)),
+        integrators=("path", "march"),
+        aabb=np.array([[-1.5, -1.5, -0.85], [1.5, 1.5, 0.6]]),
+    )
+
+
+def mist(density: float = 0.5, height: float = 0.5) -> Scene:
+    """the solids in fog that thins with height, in a box of air"""
+    medium = media.exponential(
+        (-1.5, -1.5, -0.7), (1.5, 1.5, 0.9), height, 2.0 * density, 0.95, phase=phase.henyey_greenstein(0.4)
+    )
+    scene = solids()
+    scene.medium = medium
+    scene.integrators = ("path", "march", "deep")
+    scene.aabb = np.array([[-1.5, -1.5, -0.85], [1.5, 1.5, 0.9]])
+    return scene
+
+
+def _stage() -> list:
+    return [
+        surfaces.box(0, (-1.5, -1.5, -0.8), (1.5, 1.5, -0.7)),
+        surfaces.sphere(1, (-0.6, -0.25, -0.2), 0.5),
+        surfaces.box(2, (0.2, 0.3, -0.7), (0.9, 1.0, 0.1)),
+        surfaces.sphere(3, (-0.2, 0.85, -0.42), 0.28),
+        surfaces.sphere(5, (0.0, -1.0, -0.5), 0.2),
+    ]
+
+
+def _stage_materials() -> list:
+    return [
+        materials.lambert((0.72, 0.68, 0.60), (0.16, 0.18, 0.22), 0.3),
+        materials.blinn_phong((0.62, 0.04, 0.05), 0.25, 80),
+        materials.blinn_phong((0.05, 0.22, 0.55), 0.12, 30),
+        materials.blinn_phong((0.75, 0.48, 0.08), 0.22, 60),
+        materials.blinn_phong((0.08, 0.50, 0.22), 0.25, 50),
+        materials.dielectric(1.5),
+    ]
+
+
+def _gem(material: int, centre, radius: float) -> np.ndarray:
+    """An octahedron stretched along z."""
+    v = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float) * radius
+    f = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]]
+    return surfaces.mesh(material, v + np.asarray(centre), f)
+
+
+def fog(density: float = 0.35, g: float = 0.55) -> Scene:
+    """fog with shafts of light that fall through a slotted roof onto a checker floor"""
+    medium = media.homogeneous((-2, -2, -1), (2, 2, 1.5), density, 0.97, phase=phase.henyey_greenstein(g))
+    slots = [surfaces.box(1, (-2, -2 + 0.62 * k, 1.2), (2, -1.62 + 0.62 * k, 1.27)) for k in range(7)]
+    bars = [surfaces.box(1, (-2 + 1.05 * k, -2, 1.2), (-1.4 + 1.05 * k, 2, 1.27)) for k in range(4)]
+    return Scene(
+        medium=medium._replace(step=0.04),
+        shapes=[
+            surfaces.box(0, (-2, -2, -1.1), (2, 2, -1.0)),
+            surfaces.sphere(2, (-0.5, -0.3, -0.55), 0.45),
+            surfaces.box(3, (0.5, 0.1, -1.0), (1.1, 0.7, -0.2)),
+            *slots,
+            *bars,
+        ],
+        materials=[
+            materials.lambert((0.7, 0.68, 0.62), (0.12, 0.13, 0.16), 0.4),
+            materials.lambert((0.25, 0.2, 0.16)),
+            materials.blinn_phong((0.6, 0.06, 0.05), 0.2, 60),
+            materials.lambert((0.1, 0.3, 0.5)),
+        ],
+        lights=[lights.directional((0.45, -0.35, 1.0), (9.0, 7.6, 5.6)), lights.environment((0.04, 0.05, 0.07))],
+        viewpoints=Viewpoints(target=(0, 0, -0.2), radius=5.6, elevation=(4, 22), fov=42),
+        integrators=("march", "path", "deep"),
+        aabb=np.array([[-2.05, -2.05, -1.15], [2.05, 2.05, 1.5]]),
+    )
+
+
+def cloth(roughness: float = 0.25, density: float = 60.0, resolution: int = 192) -> Scene:
+    """a woven cloth of SGGX fibres: warp and weft are two directions of microflakes"""
+    lo, hi = np.array([-1.2, -1.2, -0.35]), np.array([1.2, 1.2, 0.35])
+    n = resolution
+    shape = (n, n, max(int(n * 0.7 / 2.4) + 1, 16))
+    x, y, z = np.meshgrid(*[np.linspace(lo[k], hi[k], shape[k]) for k in range(3)], indexing="ij", sparse=True)
+    pitch, thick = 0.15, 0.05
+    wave = 0.14 * np.sin(2.1 * x + 0.4) * np.cos(1.7 * y)  # the cloth hangs in folds
+    over = np.sin(np.pi * x / pitch) * np.sin(np.pi * y / pitch)
+    to_warp = ((np.mod(y, pitch) - pitch / 2) / (0.46 * pitch)) ** 2 + ((z - wave - 0.03 * over) / thick) ** 2
+    to_weft = ((np.mod(x, pitch) - pitch / 2) / (0.46 * pitch)) ** 2 + ((z - wave + 0.03 * over) / thick) ** 2
+    density_grid = density * np.clip(1.6 * (1.0 - np.minimum(to_warp, to_weft)), 0, 1)
+    attribute = np.where(to_warp < to_weft, 0.0, 1.0) + 0.0 * density_grid
+    flake = phase.microflakes(flakes.fibre((1, 0, 0), roughness), flakes.fibre((0, 1, 0), roughness))
+    medium = media.grid(
+        density_grid, lo, hi, 1.0, [(0.92, 0.28, 0.22), (0.93, 0.80, 0.48)], phase=flake, attribute=attribute
+    )
+    return Scene(
+        medium=medium,
+        lights=[lights.directional((0.6, -0.5, 1.0), 5.0), lights.sky((0.5, 0.6, 0.9), 0.8, 0.3)],
+        viewpoints=Viewpoints(radius=4.2, elevation=(25, 75)),
+        integrators=("path", "deep", "march"),
+        aabb=np.array([lo, hi]),
+    )
+
+
+def leaf(thickness: float = 1.4) -> Scene:
+    """a layered leaf: SpongeCake of a waxy skin over green flesh, lit from both sides"""
+    rows, faces = [], []
+    n, m = 48, 16
+    for i in range(n + 1):
+        s = i / n
+        half = 0.55 * np.sin(np.pi * s**0.8) ** 0.9 * (1 - 0.25 * s)
+        for j in range(m + 1):
+            t = 2.0 * j / m - 1.0
+            x = -1.2 + 2.4 * s
+            rows.append((x, half * t, 0.25 * np.sin(1.9 * s) - 0.35 * s * s + 0.20 * abs(t) * half - 0.02 * np.cos(40 * s)))
+    for i in range(n):
+        for j in range(m):
+            a = i * (m + 1) + j
+            faces += [[a, a + m + 1, a + 1], [a + 1, a + m + 1, a + m + 2]]
+    skin = spongecake.layer(0.35, flakes.surface((0, 0, 1), 0.2), (0.9, 0.95, 0.85))
+    flesh = spongecake.layer(thickness, flakes.surface((0, 0, 1), 0.75), (0.38, 0.80, 0.12))
+    vein = spongecake.layer(0.3, flakes.fibre((1, 0, 0), 0.3), (0.75, 0.9, 0.4))
+    return Scene(
+        triangles=surfaces.mesh(0, np.array(rows), np.array(faces)),
+        materials=[materials.layered(0, 3)],
+        layers=[skin, vein, flesh],
+        lights=[lights.directional((0.3, -0.5, 1.0), 4.5), lights.sky((0.5, 0.65, 1.0), 0.8, 0.35)],
+        viewpoints=Viewpoints(radius=3.6, elevation=(15, 70)),
+        integrators=("path", "march"),
+        aabb=np.array([[-1.3, -0.7, -0.7], [1.3, 0.7, 0.7]]),
+    )

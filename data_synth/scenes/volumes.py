@@ -1,0 +1,212 @@
+"""Scenes of volumes: clouds, smoke, fire and a CT-like phantom. Most take any imported volume instead."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from data_synth import clouds, lights, materials, media, phase, surfaces
+from data_synth.cameras import Viewpoints
+from data_synth.errors import InputError
+from data_synth.jit import in_bands, kernel
+from data_synth.noise import cloud_textures, texture_at
+from data_synth.scene import Scene
+from data_synth.volumes import read_volume
+
+CLOUD_PHASE = phase.two_lobes(0.75, -0.2, 0.75)
+
+
+def cloud(
+    coverage: float = 0.9, density: float = 24.0, resolution: int = 128, erosion: float = 0.28, seed: int = 0,
+    volume: str | None = None,
+) -> Scene:  # fmt: skip
+    """a cumulus at sunset: warm sun from the side, blue sky above"""
+    lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
+    shape = (resolution, resolution, int(resolution * 1.7 / 2.6))
+    rho, lo, hi = _imported(volume, clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed), lo, hi)
+    medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
+    return Scene(
+        medium=medium,
+        lights=[lights.directional((1.0, -0.45, 0.38), (14.0, 8.2, 4.4)), lights.sky((0.45, 0.62, 1.0), 0.75, 0.35)],
+        viewpoints=Viewpoints(radius=4.6, elevation=(-5, 60), fov=40),
+        integrators=("deep", "march", "path", "preview"),
+        aabb=np.array([lo, hi]),
+        exposure=0.9,
+    )
+
+
+def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int = 128, seed: int = 3) -> Scene:
+    """a thunderhead with its anvil under a high sun"""
+    rho = clouds.cloud("cumulonimbus", (resolution,) * 3, coverage, 1.3, 0.25, seed)
+    medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.995, phase=CLOUD_PHASE)
+    return Scene(
+        medium=medium,
+        lights=[lights.directional((0.8, -0.6, 0.9), (10.5, 9.6, 8.4)), lights.sky((0.35, 0.55, 1.0), 0.7, 0.3)],
+        viewpoints=Viewpoints(radius=4.8, elevation=(-10, 50), fov=40),
+        integrators=("deep", "march", "path", "preview"),
+        aabb=np.array([[-1.2] * 3, [1.2] * 3]),
+        exposure=0.9,
+    )
+
+
+def stratus(coverage: float = 0.75, density: float = 14.0, resolution: int = 160, seed: int = 1) -> Scene:
+    """a broken layer of stratus, seen from above and below"""
+    lo, hi = (-1.6, -1.6, -0.3), (1.6, 1.6, 0.3)
+    rho = clouds.cloud("stratus", (resolution, resolution, resolution // 4), coverage, 1.6, 0.35, seed)
+    medium = media.grid(rho, lo, hi, density, 0.99, phase=CLOUD_PHASE)
+    return Scene(
+        medium=medium,
+        lights=[lights.directional((0.9, 0.3, 0.6), (9.0, 8.0, 6.8)), lights.sky((0.4, 0.6, 1.0), 0.8, 0.3)],
+        viewpoints=Viewpoints(radius=4.6, elevation=(10, 65), fov=40),
+        integrators=("deep", "march", "path", "preview"),
+        aabb=np.array([lo, hi]),
+        exposure=0.9,
+    )
+
+
+def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: str | None = None) -> Scene:
+    """a smoke plume over a floor that shows its shadow; takes any volume: --volume smoke.vdb"""
+    lo, hi = (-0.8, -0.8, -1.1), (0.8, 0.8, 1.3)
+    if volume is None:
+        n = resolution
+        rho = np.empty((int(n * 2 / 3), int(n * 2 / 3), n), np.float32)
+        detail = cloud_textures(seed, 64).base
+        in_bands(lambda a, b: _plume(detail, rho, a, b), rho.shape[0], 4)
+    else:
+        rho, lo, hi = _imported(volume, None, lo, hi, up="y")
+    medium = media.grid(rho, lo, hi, density, (0.80, 0.78, 0.76), phase=phase.henyey_greenstein(0.3))
+    return Scene(
+        medium=medium,
+        shapes=[surfaces.box(0, (-1.5, -1.5, -1.25), (1.5, 1.5, -1.15))],
+        materials=[materials.lambert((0.75, 0.72, 0.66), (0.45, 0.47, 0.52), 0.3)],
+        lights=[lights.directional((0.9, -0.5, 0.9), (6.5, 6.0, 5.2)), lights.sky((0.4, 0.55, 0.9), 0.7, 0.25)],
+        viewpoints=Viewpoints(radius=5.0, elevation=(5, 55), fov=40),
+        integrators=("deep", "march", "path"),
+        aabb=np.array([[-1.5, -1.5, -1.25], [1.5, 1.5, 1.35]]),
+        exposure=0.9,
+    )
+
+
+@kernel
+def _plume(t, out, first, last):
+    """A column that widens and curls as it rises: noise of noise, cut out of a cone."""
+    nx, ny, nz = out.shape
+    for i in range(first, last):
+        for j in range(ny):
+            for k in range(nz):
+                x, y, z = i / (nx - 1) - 0.5, j / (ny - 1) - 0.5, k / (nz - 1)
+                bend = 0.16 * z
+                wx = texture_at(t, 0.7 * x + 0.1, 0.7 * y, 0.55 * z - 0.1, 0) - 0.55
+                wy = texture_at(t, 0.7 * x + 0.5, 0.7 * y + 0.3, 0.55 * z + 0.2, 0) - 0.55
+                px, py = x + 1.3 * bend * wx, y + 1.3 * bend * wy
+                radius = 0.07 + 0.30 * z**0.8
+                r = (px * px + py * py) ** 0.5 / radius
+                billow = texture_at(t, 1.1 * px, 1.1 * py, 0.9 * z, 1) + 0.5 * texture_at(t, 2.3 * px, 2.3 * py, 2 * z, 2)
+                edge = 1.35 * billow + 0.42 - r
+                fade = min(1.0, 12.0 * z) * min(1.0, 5.0 * (1.0 - z))
+                out[i, j, k] = min(max(2.2 * edge, 0.0), 1.0) * fade * (1.0 - 0.65 * z)
+
+
+def explosion(density: float = 16.0, heat: float = 9.0, resolution: int = 128, seed: int = 4) -> Scene:
+    """a fireball: soot that glows as a black body where it is hot"""
+    n = resolution
+    rho, hot = np.empty((n, n, n), np.float32), np.empty((n, n, n), np.float32)
+    t = cloud_textures(seed, 64).base
+    in_bands(lambda a, b: _fireball(t, rho, hot, a, b), n, 4)
+    kelvin = np.linspace(0.0, 1.0, 32)
+    glow = np.stack([kelvin**2.2, 0.42 * kelvin**4.0, 0.12 * kelvin**7.5], axis=1) * heat
+    medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.35, glow, attribute=hot)
+    return Scene(
+        medium=medium,
+        lights=[lights.directional((0.7, -0.4, 1.0), (2.2, 2.2, 2.4)), lights.sky((0.3, 0.4, 0.6), 0.35, 0.15)],
+        viewpoints=Viewpoints(radius=4.6, elevation=(-10, 50), fov=40),
+        integrators=("deep", "march", "path", "emission"),
+        aabb=np.array([[-1.2] * 3, [1.2] * 3]),
+    )
+
+
+@kernel
+def _fireball(t, rho, hot, first, last):
+    n = rho.shape[0]
+    for i in range(first, last):
+        for j in range(n):
+            for k in range(n):
+                x, y, z = 2.0 * i / (n - 1) - 1.0, 2.0 * j / (n - 1) - 1.0, 2.0 * k / (n - 1) - 1.0
+                r = (x * x + y * y + z * z) ** 0.5
+                big = texture_at(t, 0.40 * x, 0.40 * y, 0.40 * z, 1)
+                small = texture_at(t, 0.9 * x, 0.9 * y, 0.9 * z, 1)
+                surface = 0.30 + 0.72 * big + 0.20 * small
+                d = surface - r
+                rho[i, j, k] = min(max(7.0 * d, 0.0), 1.0) * min(1.0, 6.0 * (1.0 - r) if r < 1.0 else 0.0)
+                crack = 1.15 - 1.25 * texture_at(t, 1.1 * x + 0.3, 1.1 * y, 1.1 * z, 2)
+                hot[i, j, k] = min(max(1.15 * crack - 0.55 * r - 0.9 * max(0.10 - d, 0.0) + 0.15, 0.0), 1.0)
+
+
+def phantom(density: float = 40.0, resolution: int = 128, volume: str | None = None) -> Scene:
+    """a CT-like head phantom through a transfer function: skin, bone and inner organs; takes --volume stent.npz"""
+    if volume is None:
+        lo, hi = (-0.8, -1.0, -0.8), (0.8, 1.0, 0.8)
+        value = _head(resolution)
+    else:
+        value, lo, hi = _imported(volume, None, (-1.1,) * 3, (1.1,) * 3)
+    # tissue value -> opacity and colour: (value, extinction, r, g, b)
+    points = np.array(
+        [
+            [0.00, 0.00, 0.80, 0.60, 0.50],
+            [0.10, 0.00, 0.80, 0.60, 0.50],
+            [0.18, 0.03, 0.85, 0.55, 0.42],
+            [0.30, 0.02, 0.75, 0.25, 0.22],
+            [0.45, 0.10, 0.80, 0.30, 0.25],
+            [0.60, 0.30, 0.90, 0.80, 0.60],
+            [0.80, 0.80, 0.96, 0.93, 0.85],
+            [1.00, 1.00, 1.00, 0.98, 0.92],
+        ]
+    )
+    opacity = np.interp(value, points[:, 0], points[:, 1]).astype(np.float32)
+    colours = np.stack([np.interp(np.linspace(0, 1, 64), points[:, 0], points[:, c]) for c in (2, 3, 4)], axis=1)
+    medium = media.grid(opacity, lo, hi, density, colours, attribute=value)
+    return Scene(
+        medium=medium,
+        lights=[lights.directional((0.6, -0.8, 0.9), 7.0), lights.environment(0.55)],
+        viewpoints=Viewpoints(radius=4.0, elevation=(-20, 60), fov=38),
+        integrators=("deep", "march", "path", "emission"),
+        aabb=np.array([lo, hi]),
+    )
+
+
+def _head(n: int) -> np.ndarray:
+    """Ellipsoids after Shepp & Logan, as tissue values in [0, 1] with soft edges."""
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij", sparse=True)
+
+    def ball(cx, cy, cz, rx, ry, rz):
+        r = np.sqrt(((x - cx) / rx) ** 2 + ((y - cy) / ry) ** 2 + ((z - cz) / rz) ** 2)
+        return np.clip((1.0 - r) * min(rx, ry, rz) * n / 5.0 + 0.5, 0.0, 1.0)
+
+    skin, outer, inner = ball(0, 0, 0, 0.86, 0.92, 0.9), ball(0, 0, 0, 0.76, 0.83, 0.8), ball(0, 0, 0, 0.70, 0.77, 0.74)
+    value = 0.17 * skin + 0.68 * outer - 0.60 * inner
+    for c, tissue in (
+        ((-0.26, 0.05, 0.1, 0.16, 0.40, 0.3), 0.22),
+        ((0.26, 0.05, 0.1, 0.16, 0.40, 0.3), 0.22),
+        ((0.0, 0.35, 0.0, 0.18, 0.2, 0.25), 0.35),
+        ((0.0, -0.45, -0.1, 0.10, 0.12, 0.12), 0.5),
+    ):
+        value += tissue * ball(*c)
+    cut = np.clip((0.05 - np.minimum(-y, x)) * n / 5.0 + 0.5, 0, 1)  # a quarter is taken out to look inside
+    return np.clip(value * cut, 0, 1)
+
+
+def _imported(volume: str | None, default, lo, hi, up: str = "z") -> tuple:
+    """The volume file's samples scaled to [0, 1] in a box as large as lo..hi allows, or the default."""
+    if volume is None:
+        return default, lo, hi
+    values, spacing = read_volume(volume)
+    if up == "y":  # right-handed: x, y, z -> x, -z, y
+        values, spacing = values[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]
+    low, high = float(values.min()), float(values.max())
+    if high <= low or high <= 0:
+        raise InputError(f"{volume}: expected a density that varies and is somewhere positive")
+    values = np.clip(values / high, 0.0, 1.0)
+    extent = (np.array(values.shape) - 1) * spacing
+    room = np.array(hi) - np.array(lo)
+    extent *= (room / extent).min()
+    middle = 0.5 * (np.array(hi) + np.array(lo))
+    return np.ascontiguousarray(values, np.float32), tuple(middle - extent / 2), tuple(middle + extent / 2)
