@@ -126,10 +126,10 @@ class OccupancyGrid:
 
     def update(self, positions: Tensor, sigmas: Tensor) -> None:
         """Note coefficients (n,) seen at (n, 3): a visited cell keeps max(decay * old, largest seen)."""
-        seen = torch.full_like(self.sigmas, -1).scatter_reduce_(
-            0, self.cells_at(positions), sigmas.detach().float(), "amax"
-        )
-        self.sigmas = torch.where(seen < 0, self.sigmas, torch.maximum(self.sigmas * self.decay, seen))
+        cells = self.cells_at(positions)
+        # Points of one cell all write the same decayed value: work in proportion to the points, not to the grid.
+        self.sigmas[cells] = self.sigmas[cells] * self.decay
+        self.sigmas.scatter_reduce_(0, cells, sigmas.detach().float(), "amax")
 
     def probe(self, density: Callable[[Tensor], Tensor], n_points: int, generator: torch.Generator) -> None:
         """Look at random points of random cells, so that space that was given up can come back."""

@@ -22,6 +22,7 @@ from nerfvol.quadrature import Composite, accumulate, composite, composite_packe
 from nerfvol.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
 
 if TYPE_CHECKING:
+    from nerfvol.cameras import Camera
     from nerfvol.datasets import Dataset, SceneBounds
 
 
@@ -242,6 +243,12 @@ class FieldTrainer:
     def render(self, rays_o: Tensor, rays_d: Tensor, chunk: int = 4096) -> dict[str, Tensor]:
         """``render_field`` of the field as it is now."""
         return render_field(self.field, rays_o, rays_d, self.background, self.find_samples, chunk)
+
+    def render_camera(self, camera: Camera) -> np.ndarray:
+        """(height, width, 3) float32 image of the field as ``camera`` sees it."""
+        rays_o, rays_d = (torch.from_numpy(rays) for rays in camera.rays())
+        shape = (camera.intrinsics.height, camera.intrinsics.width, 3)
+        return self.render(rays_o, rays_d)["rgb"].numpy().reshape(shape)
 
     def step(self, progress: float | None = None) -> dict[str, float]:
         """One optimisation step.

@@ -17,11 +17,11 @@ from nerfvol.distill import (
     dilated,
     distill,
     largest_weights,
-    merge_smooth,
     write_values,
 )
 from nerfvol.errors import InputError
 from nerfvol.fields import Domain
+from nerfvol.merge import merge_smooth
 from nerfvol.octree import OFFSETS, Octree, explin
 
 DOMAIN = Domain((0.1, -0.2, 0.3), 1.0)

@@ -52,6 +52,8 @@ def test_inverse_cdf_follows_the_weights() -> None:
 def test_inverse_cdf_without_a_generator_gives_the_quantiles() -> None:
     t = inverse_cdf(torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[1.0, 1.0]]), 4)
     torch.testing.assert_close(t, torch.tensor([[0.25, 0.75, 1.5, 2.5]]))
+    # A quantile on the edge of an empty bin lies where the next mass begins.
+    assert float(inverse_cdf(torch.tensor([[0.0, 1.0, 2.0, 3.0]]), torch.tensor([[1.0, 0.0, 1.0]]), 1)) == 2
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])

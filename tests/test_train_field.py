@@ -58,6 +58,7 @@ def test_learns_the_ball(dataset: Dataset, sampler: str) -> None:
     camera = dataset.cameras[0].scaled(2)
     o, d = (torch.from_numpy(a) for a in camera.rays())
     image = trainer.render(o, d, chunk=100)
+    np.testing.assert_allclose(trainer.render_camera(camera).reshape(-1, 3), image["rgb"], atol=1e-6)
     target = dataset.pyramid((1, 1, 1), 2)[0].reshape(-1, 3) / 255.0
     assert -10 * math.log10(((image["rgb"].numpy() - target) ** 2).mean()) > constant + 6
     inside = torch.from_numpy((target < 0.99).any(1))
