@@ -331,3 +331,20 @@ def test_intrinsics_equality_shares_one_ray_table(tmp_path):
     dataset = load_dataset(tmp_path)
     assert len({camera.intrinsics for camera in dataset.cameras}) == 1
     assert dataset.cameras[0].intrinsics == Intrinsics(24, 16, 30.0, 30.0, 12.0, 8.0)
+
+
+def test_two_independent_camera_codes_agree_through_the_file(tmp_path):
+    """data_synth writes poses with its own camera code; the rays made from its file are the rays it rendered with."""
+    from data_synth.cameras import Camera as SynthCamera
+    from data_synth.cameras import look_at, pixel_ray
+
+    synth = [SynthCamera(24, 16, 31.7, look_at(eye)) for eye in ([3.0, 1.0, 2.0], [-2.0, 2.5, -0.3], [0.1, -4.0, 1.0])]
+    names = scenes.save_images(tmp_path, scenes.random_images(3))
+    frames = [{"file_path": n, "transform_matrix": c.c2w.tolist()} for n, c in zip(names, synth, strict=True)]
+    for split in ("train", "val"):
+        scenes.write_json(tmp_path / f"transforms_{split}.json", camera_angle_x=synth[0].angle_x, frames=frames)
+    for camera, truth in zip(load_dataset(tmp_path).cameras, synth, strict=True):
+        origin, directions = camera.rays()
+        expected = [pixel_ray(truth.data(), i + 0.5, j + 0.5) for j in range(16) for i in range(24)]
+        np.testing.assert_allclose(origin, truth.c2w[:3, 3], rtol=2.0**-23)
+        np.testing.assert_allclose(directions, expected, atol=4 * 2.0**-23)
