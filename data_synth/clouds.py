@@ -1,6 +1,6 @@
 """Cloud densities after [Horizon] (Schneider & Vos 2015), PHYSICS 13.
 
-base   = remap(Perlin-Worley, 1 - low-frequency Worley, 1 -> 0, 1) x height gradient of the cloud type
+base   = remap(Perlin-Worley, low-frequency Worley - 1 -> 1, 0 -> 1), its contrast stretched, x height gradient
 shaped = remap(base, 1 - coverage(x, y) -> 1, 0 -> 1) x coverage
 final  = remap(shaped, detail x edge -> 1, 0 -> 1): the detail erodes the edges, wispy below and billowy above,
 and the detail is looked up at a place that curl noise has distorted.
@@ -37,11 +37,10 @@ def footprint(kind, x, y, h, coverage):
     if kind == STRATUS:
         edge = min(x, y, 1.0 - x, 1.0 - y)
         return coverage * remap(edge, 0.0, 0.12, 0.0, 1.0)
-    reach = 0.46
+    reach = 0.52 - 0.10 * h
     if kind == CUMULONIMBUS:
-        trunk = 0.30 + 0.06 * math.sin(9.0 * h)
-        reach = trunk + 0.20 * remap(h, 0.62, 0.88, 0.0, 1.0)
-    return coverage * remap(r, 0.45 * reach, reach, 1.0, 0.0)
+        reach = 0.34 + 0.05 * math.sin(9.0 * h) + 0.26 * remap(h, 0.66, 0.86, 0.0, 1.0)
+    return coverage * remap(r, 0.15 * reach, reach, 1.0, 0.0)
 
 
 @jit
@@ -57,8 +56,9 @@ def cloud_density(t, kind, coverage, frequency, erosion, x, y, z):
         + 0.25 * texture_at(t.base, f * x, f * y, f * z, 2)
         + 0.125 * texture_at(t.base, f * x, f * y, f * z, 3)
     )
-    base = remap(texture_at(t.base, f * x, f * y, f * z, 0), -(1.0 - low), 1.0, 0.0, 1.0) * gradient
-    shaped = remap(base, 1.0 - cover, 1.0, 0.0, 1.0)
+    base = remap(texture_at(t.base, f * x, f * y, f * z, 0), low - 1.0, 1.0, 0.0, 1.0)
+    base = remap(base, 0.52, 0.92, 0.0, 1.0) * gradient
+    shaped = remap(base, 1.0 - cover, 1.3 - cover, 0.0, 1.0)
     if shaped <= 0.0:
         return 0.0
     n = t.curl.shape[0]

@@ -152,7 +152,8 @@ def leaf(thickness: float = 1.4) -> Scene:
         for j in range(m + 1):
             t = 2.0 * j / m - 1.0
             x = -1.2 + 2.4 * s
-            rows.append((x, half * t, 0.25 * np.sin(1.9 * s) - 0.35 * s * s + 0.20 * abs(t) * half - 0.02 * np.cos(40 * s)))
+            z = 0.25 * np.sin(1.9 * s) - 0.35 * s * s + 0.20 * abs(t) * half - 0.02 * np.cos(40 * s)
+            rows.append((x, half * t, z))
     for i in range(n):
         for j in range(m):
             a = i * (m + 1) + j

@@ -12,11 +12,11 @@ from data_synth.noise import cloud_textures, texture_at
 from data_synth.scene import Scene
 from data_synth.volumes import read_volume
 
-CLOUD_PHASE = phase.two_lobes(0.75, -0.2, 0.75)
+CLOUD_PHASE = phase.two_lobes(0.6, -0.25, 0.6)
 
 
 def cloud(
-    coverage: float = 0.9, density: float = 24.0, resolution: int = 128, erosion: float = 0.28, seed: int = 0,
+    coverage: float = 0.95, density: float = 22.0, resolution: int = 128, erosion: float = 0.3, seed: int = 0,
     volume: str | None = None,
 ) -> Scene:  # fmt: skip
     """a cumulus at sunset: warm sun from the side, blue sky above"""
@@ -26,7 +26,10 @@ def cloud(
     medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
-        lights=[lights.directional((1.0, -0.45, 0.38), (14.0, 8.2, 4.4)), lights.sky((0.45, 0.62, 1.0), 0.75, 0.35)],
+        lights=[
+            lights.directional((1.0, -0.45, 0.38), (34.0, 19.0, 9.5)),
+            lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5)),
+        ],
         viewpoints=Viewpoints(radius=4.6, elevation=(-5, 60), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([lo, hi]),
@@ -36,11 +39,14 @@ def cloud(
 
 def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int = 128, seed: int = 3) -> Scene:
     """a thunderhead with its anvil under a high sun"""
-    rho = clouds.cloud("cumulonimbus", (resolution,) * 3, coverage, 1.3, 0.25, seed)
+    rho = clouds.cloud("cumulonimbus", (resolution,) * 3, coverage, 1.2, 0.25, seed)
     medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.995, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
-        lights=[lights.directional((0.8, -0.6, 0.9), (10.5, 9.6, 8.4)), lights.sky((0.35, 0.55, 1.0), 0.7, 0.3)],
+        lights=[
+            lights.directional((0.8, -0.6, 0.9), (26.0, 24.0, 21.0)),
+            lights.sky((0.8, 1.15, 1.9), (1.3, 1.35, 1.5), 0.5),
+        ],
         viewpoints=Viewpoints(radius=4.8, elevation=(-10, 50), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([[-1.2] * 3, [1.2] * 3]),
@@ -48,14 +54,17 @@ def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int 
     )
 
 
-def stratus(coverage: float = 0.75, density: float = 14.0, resolution: int = 160, seed: int = 1) -> Scene:
+def stratus(coverage: float = 0.72, density: float = 16.0, resolution: int = 160, seed: int = 1) -> Scene:
     """a broken layer of stratus, seen from above and below"""
     lo, hi = (-1.6, -1.6, -0.3), (1.6, 1.6, 0.3)
     rho = clouds.cloud("stratus", (resolution, resolution, resolution // 4), coverage, 1.6, 0.35, seed)
     medium = media.grid(rho, lo, hi, density, 0.99, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
-        lights=[lights.directional((0.9, 0.3, 0.6), (9.0, 8.0, 6.8)), lights.sky((0.4, 0.6, 1.0), 0.8, 0.3)],
+        lights=[
+            lights.directional((0.9, 0.3, 0.6), (22.0, 19.0, 15.0)),
+            lights.sky((0.8, 1.1, 1.8), (1.3, 1.3, 1.4), 0.5),
+        ],
         viewpoints=Viewpoints(radius=4.6, elevation=(10, 65), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([lo, hi]),
@@ -63,7 +72,7 @@ def stratus(coverage: float = 0.75, density: float = 14.0, resolution: int = 160
     )
 
 
-def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: str | None = None) -> Scene:
+def smoke(density: float = 11.0, resolution: int = 128, seed: int = 2, volume: str | None = None) -> Scene:
     """a smoke plume over a floor that shows its shadow; takes any volume: --volume smoke.vdb"""
     lo, hi = (-0.8, -0.8, -1.1), (0.8, 0.8, 1.3)
     if volume is None:
@@ -77,8 +86,8 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
     return Scene(
         medium=medium,
         shapes=[surfaces.box(0, (-1.5, -1.5, -1.25), (1.5, 1.5, -1.15))],
-        materials=[materials.lambert((0.75, 0.72, 0.66), (0.45, 0.47, 0.52), 0.3)],
-        lights=[lights.directional((0.9, -0.5, 0.9), (6.5, 6.0, 5.2)), lights.sky((0.4, 0.55, 0.9), 0.7, 0.25)],
+        materials=[materials.lambert((0.42, 0.40, 0.37), (0.20, 0.21, 0.24), 0.3)],
+        lights=[lights.directional((0.9, -0.5, 0.9), (11.0, 10.0, 8.6)), lights.sky((0.5, 0.65, 1.0), 0.8, 0.3)],
         viewpoints=Viewpoints(radius=5.0, elevation=(5, 55), fov=40),
         integrators=("deep", "march", "path"),
         aabb=np.array([[-1.5, -1.5, -1.25], [1.5, 1.5, 1.35]]),
@@ -100,7 +109,8 @@ def _plume(t, out, first, last):
                 px, py = x + 1.3 * bend * wx, y + 1.3 * bend * wy
                 radius = 0.07 + 0.30 * z**0.8
                 r = (px * px + py * py) ** 0.5 / radius
-                billow = texture_at(t, 1.1 * px, 1.1 * py, 0.9 * z, 1) + 0.5 * texture_at(t, 2.3 * px, 2.3 * py, 2 * z, 2)
+                billow = texture_at(t, 1.1 * px, 1.1 * py, 0.9 * z, 1)
+                billow += 0.5 * texture_at(t, 2.3 * px, 2.3 * py, 2.0 * z, 2)
                 edge = 1.35 * billow + 0.42 - r
                 fade = min(1.0, 12.0 * z) * min(1.0, 5.0 * (1.0 - z))
                 out[i, j, k] = min(max(2.2 * edge, 0.0), 1.0) * fade * (1.0 - 0.65 * z)
@@ -137,8 +147,9 @@ def _fireball(t, rho, hot, first, last):
                 surface = 0.30 + 0.72 * big + 0.20 * small
                 d = surface - r
                 rho[i, j, k] = min(max(7.0 * d, 0.0), 1.0) * min(1.0, 6.0 * (1.0 - r) if r < 1.0 else 0.0)
-                crack = 1.15 - 1.25 * texture_at(t, 1.1 * x + 0.3, 1.1 * y, 1.1 * z, 2)
-                hot[i, j, k] = min(max(1.15 * crack - 0.55 * r - 0.9 * max(0.10 - d, 0.0) + 0.15, 0.0), 1.0)
+                crack = 1.2 - 1.7 * texture_at(t, 0.35 * x + 0.3, 0.35 * y, 0.35 * z, 1)
+                crack += 0.35 - 0.9 * texture_at(t, 0.9 * x, 0.9 * y + 0.4, 0.9 * z, 2)
+                hot[i, j, k] = min(max(0.62 * crack - 0.30 * r - 0.2 * z - 1.5 * max(0.08 - d, 0.0) + 0.22, 0.0), 1.0)
 
 
 def phantom(density: float = 40.0, resolution: int = 128, volume: str | None = None) -> Scene:
