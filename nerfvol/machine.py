@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,19 @@ def peak_memory() -> int | None:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+_imported = time.perf_counter()
+
+
+def process_seconds() -> float:
+    """Seconds since this process started; where the system does not tell, since this module was imported."""
+    try:
+        # Field 22 of stat(5): start in clock ticks after boot. The name before it may hold spaces, but ends with ")".
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError, AttributeError):  # beside Linux
+        return time.perf_counter() - _imported
 
 
 def describe_hardware() -> dict[str, Any]:

@@ -1,0 +1,241 @@
+"""What surrounds the steps of a training run: its data, clock, log, checkpoints and previews.
+
+Nothing here changes a number of the result, save that the clock ends the phases of a run that has a time budget.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+
+from nerfvol import pictures, runs
+from nerfvol.camera_paths import describe_orbit
+from nerfvol.cameras import Camera
+from nerfvol.checkpoint import save_checkpoint
+from nerfvol.config import Config
+from nerfvol.datasets import Dataset, load_dataset
+from nerfvol.datasets.images import composite_average
+from nerfvol.errors import InputError
+from nerfvol.files import ensure_writable_folder
+from nerfvol.machine import process_seconds
+from nerfvol.memory import estimate_training, largest_octree, require_memory
+from nerfvol.metrics import ssim
+
+FIELD_SHARE = 0.3
+"""Of a time budget, the most that the field gets."""
+RESERVE_SHARE = 0.2
+"""Of a time budget, the most that is kept for writing and scoring."""
+LARGEST_HELD_OUT = 32
+"""Views that a run scores itself on; `nerfvol eval` scores all there are."""
+RUNNING = 0.98
+"""Memory, per step, of the running error."""
+PREVIEW_WIDTH = 200
+"""Most pixels across of a preview."""
+
+
+class Phase(Protocol):
+    """What is optimised: the field, the octree."""
+
+    name: str
+    steps: int
+    trainer: Any
+
+    @property
+    def steps_done(self) -> int: ...
+
+    @property
+    def stage(self) -> int: ...
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """(H, W, 3) as the camera sees it."""
+        ...
+
+    def size(self) -> str:
+        """How large the representation is, in words."""
+        ...
+
+
+class Clock:
+    """Seconds of wall clock that a run has used, over all its sessions."""
+
+    def __init__(self, started: float | None, spent: float) -> None:
+        now = time.perf_counter()
+        self._zero = (now - process_seconds() if started is None else started) - spent
+
+    def elapsed(self) -> float:
+        return time.perf_counter() - self._zero
+
+
+class Run:
+    """A run's data, log, checkpoints and clock; nothing here changes a number of the result."""
+
+    def __init__(self, config: Config, clock: Clock, saved: dict[str, Any] | None) -> None:
+        self.config, self.clock, self.folder = config, clock, Path(config.out)
+        self.saved = saved or {"phase": "start", "log_bytes": 0, "stages": {}, "steps": {}}
+        self.phase: str = self.saved["phase"]
+        self.stages: dict[str, Any] = self.saved["stages"]
+        self.steps: dict[str, int] = self.saved["steps"]
+        self.phase_started, self.running = 0.0, math.nan
+        self.interrupted = False
+        self.held_out = some_views(load_dataset(config.data, "val", config.downscale), LARGEST_HELD_OUT)
+        self.dataset = load_dataset(config.data, "train", config.downscale)
+        for message in self.dataset.messages:
+            print(message)
+        estimate = estimate_training(self.dataset, largest_octree(config.octree.levels), config.octree.sh_degree)
+        require_memory(estimate)
+        lens = self.dataset.cameras[0].intrinsics
+        print(f"{len(self.dataset)} training views of {lens.width}x{lens.height}, {len(self.held_out)} held out; "
+              f"memory: {estimate.sentence()}", flush=True)  # fmt: skip
+        self.preview_folder = ensure_writable_folder(self.folder / runs.PREVIEWS)
+        self._reserve = self._time_to_finish()
+        self._last_save = time.perf_counter()
+
+    def enter(self, phase: Phase) -> None:
+        """Begin the phase, or go on inside it where the checkpoint was written in it."""
+        resumed = self.saved["phase"] == phase.name
+        if resumed:
+            phase.trainer.load_state_dict(self.saved["trainer"])
+            self.phase_started, self.running = self.saved["phase_started"], self.saved["running"]
+            print(f"resumed at step {phase.steps_done} of the {phase.name}")
+        else:
+            self.phase_started, self.running = self.clock.elapsed(), math.nan
+        self.phase = phase.name
+        self.saved = {"phase": "entered"}  # lets the old arrays go
+        if not resumed:
+            self.save(phase)
+
+    def phase_seconds(self) -> float:
+        return self.clock.elapsed() - self.phase_started
+
+    def progress(self, phase: Phase) -> float:
+        """How much of the phase is over; 1: it ends."""
+        budget = self.config.time_budget
+        if budget is None:
+            return phase.steps_done / phase.steps
+        left = budget - self._reserve - self.phase_started
+        share = min(self.config.field.time_budget, FIELD_SHARE * left) if phase.name == "field" else left
+        return self.phase_seconds() / share if share > 0 else 1.0
+
+    def follow(self, phase: Phase, error: float) -> None:
+        """Keep the running error; a number that is none ends the run before it reaches a checkpoint."""
+        if not math.isfinite(error):
+            raise InputError(
+                f"the training of the {phase.name} diverged at step {phase.steps_done}: its error is {error}; lower "
+                "the learning rates (field.learning_rate; octree.rate_density, rate_dc and rate_sh)"
+            )
+        self.running = error if math.isnan(self.running) else RUNNING * self.running + (1 - RUNNING) * error
+        self.steps[phase.name] = phase.steps_done
+
+    def status(self, phase: Phase, error: float, samples: float) -> str:
+        return f"loss {error:.2e}  PSNR {decibels(self.running):.2f}  {samples:.1f} samples/ray  {phase.size()}"
+
+    def log(self, phase: Phase, progress: float, error: float, samples: float) -> None:
+        line = {
+            "phase": phase.name, "step": phase.steps_done, "stage": phase.stage, "progress": round(progress, 6),
+            "seconds": round(self.clock.elapsed(), 3), "loss": error, "psnr": decibels(self.running),
+            "samples_per_ray": samples, "size": phase.size(),
+        }  # fmt: skip
+        self._log.write(json.dumps(line).encode() + b"\n")
+        self._log.flush()
+
+    @contextlib.contextmanager
+    def open_log(self) -> Iterator[BinaryIO]:
+        """The log, cut back to where the checkpoint left it."""
+        path = self.folder / runs.LOG
+        with path.open("r+b" if path.exists() else "w+b") as self._log:
+            self._log.truncate(min(self.saved["log_bytes"], path.stat().st_size))
+            self._log.seek(0, 2)
+            yield self._log
+
+    def checkpoint_due(self) -> bool:
+        return time.perf_counter() - self._last_save >= self.config.checkpoint_every
+
+    def save(self, phase: Phase) -> None:
+        """Write a checkpoint from which the run goes on exactly."""
+        state = {
+            "phase": phase.name, "elapsed": self.clock.elapsed(), "phase_started": self.phase_started,
+            "running": self.running, "log_bytes": self._log.tell(), "stages": self.stages, "steps": self.steps,
+            "trainer": phase.trainer.state_dict(),
+        }  # fmt: skip
+        save_checkpoint(self.folder / runs.CHECKPOINT, state)
+        self._last_save = time.perf_counter()
+
+    def preview(self, phase: Phase, moment: float) -> None:
+        """The first held-out view, small: truth beside what the phase has."""
+        camera, image = self.held_out.cameras[0], self.held_out.images[0]
+        k = max(1, -(-camera.intrinsics.width // PREVIEW_WIDTH))
+        truth = composite_average(image, self.config.background, k).astype(np.float32) / 255
+        picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
+        pictures.write_png(self.preview_folder / f"{phase.name}_{round(100 * moment):03d}.png", picture)
+
+    @contextlib.contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """The first Ctrl-C only sets a flag, so that the step in progress is finished; a second one ends at once."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def note(number: int, frame: Any) -> None:
+            if self.interrupted:
+                raise KeyboardInterrupt
+            self.interrupted = True
+            print("\nfinishing the step and saving (again: stop at once)", flush=True)
+
+        before = signal.signal(signal.SIGINT, note)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    def interruption(self, phase: Phase) -> KeyboardInterrupt:
+        place = f"step {phase.steps_done} of the {phase.name}"
+        print(f"saved at {place}; to go on: nerfvol train --resume --out {self.folder}", flush=True)
+        return KeyboardInterrupt()
+
+    def comparison_views(self) -> Dataset:
+        """The held-out views on which field, distilled and fine-tuned octree are compared."""
+        return some_views(self.held_out, self.config.compare_views)
+
+    def metadata(self) -> dict[str, Any]:
+        """What the octree file says of itself; no clock and no machine in it, so that equal runs write equal files."""
+        config = self.config
+        provenance = {"data": config.data, "init": config.init, "seed": config.seed, "downscale": config.downscale,
+                      "steps": dict(self.steps), "time_budget": config.time_budget}  # fmt: skip
+        orbit = describe_orbit(self.dataset.cameras, self.dataset.scene.aabb)
+        return {"provenance": provenance, "background": list(config.background), "orbit": orbit}
+
+    def _time_to_finish(self) -> float:
+        """Seconds to keep for writing and scoring."""
+        if self.config.time_budget is None:
+            return 0.0
+        image = self.held_out.composited(0, self.config.background)
+        started = time.perf_counter()
+        ssim(image, image)
+        view = time.perf_counter() - started + 0.15e-6 * image.size / 3
+        return min(2.0 + 1.2 * len(self.held_out) * view, RESERVE_SHARE * self.config.time_budget)
+
+
+def some_views(dataset: Dataset, most: int) -> Dataset:
+    """At most ``most`` of the dataset's views, evenly chosen."""
+    if len(dataset) <= most:
+        return dataset
+    chosen = np.linspace(0, len(dataset) - 1, most).round().astype(int)
+    return dataclasses.replace(
+        dataset, cameras=[dataset.cameras[i] for i in chosen], images=[dataset.images[i] for i in chosen],
+        names=[dataset.names[i] for i in chosen],
+    )  # fmt: skip
+
+
+def decibels(squared_error: float) -> float:
+    """PSNR of a mean squared error."""
+    return -10 * math.log10(max(squared_error, 1e-10))
