@@ -22,7 +22,7 @@ _DESCRIPTION = """\
 From posed photographs to a sparse octree radiance field, and pictures of it, on an ordinary CPU.
 
   nerfvol synth showcase --out scene                      make a scene to try it on
-  nerfvol train --data scene --out run                    train an octree (5 minutes; --time-budget changes that)
+  nerfvol train --data scene --out run                    train an octree (--time-budget 60s: in a minute)
   nerfvol eval run --data scene --split test              score it on views it has not seen
   nerfvol render run --orbit 120 --out orbit.mp4          fly around it
 """
@@ -149,7 +149,7 @@ def _train_arguments(p: _Parser) -> None:
     p.add_argument("--init", metavar="mlp|direct", help="start from a small MLP field that is trained first and then "
                    "distilled, or straight from a thin octree (default: direct)")  # fmt: skip
     p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "
-                   "run to the sections' step counts (default: 5m)")  # fmt: skip
+                   "a fixed number of steps, the same result every time (default: none)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B from 0 to 1: what images with alpha "
                    "are composited on (default: white)")  # fmt: skip
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")

@@ -86,6 +86,12 @@ def _octree_section() -> Any:
     return OctreeConfig()
 
 
+def _distill_section() -> Any:
+    from nerfvol.distill import DistillConfig
+
+    return DistillConfig()
+
+
 @dataclass
 class Config:
     """Everything one training run depends on. ``nerfvol train`` writes it, resolved, to RUN/config.yaml."""
@@ -96,8 +102,8 @@ class Config:
     """Run folder."""
     init: Literal["mlp", "direct"] = "direct"
     """Where the octree starts: a small MLP field that is trained and distilled, or a thin, nearly empty octree."""
-    time_budget: Annotated[float | None, seconds] = 300.0
-    """Seconds of wall clock from the start of the process; None: until the step counts of the sections are reached."""
+    time_budget: Annotated[float | None, seconds] = None
+    """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     background: Colour = (1.0, 1.0, 1.0)
     """Colour behind the scene, RGB in [0, 1]; images with alpha are composited on it."""
     downscale: Count = 1
@@ -109,8 +115,14 @@ class Config:
     """Go on from RUN's checkpoint."""
     checkpoint_every: Seconds = 30.0
     """Seconds between checkpoints."""
+    storage: Literal["float32", "float16", "compact"] = "compact"
+    """How octree files hold their values: exactly, halved, or quantised to about a tenth (docs/file_format.md)."""
+    compare_views: Count = 2
+    """Held-out views on which field, distilled and fine-tuned octree are compared (a field renders slowly)."""
     field: Any = dataclasses.field(default_factory=_field_section)
     """Section: the MLP field (nerfvol.train_field.FieldConfig)."""
+    distill: Any = dataclasses.field(default_factory=_distill_section)
+    """Section: the field's way into the octree (nerfvol.distill.DistillConfig)."""
     octree: Any = dataclasses.field(default_factory=_octree_section)
     """Section: the octree and its optimisation (nerfvol.finetune.OctreeConfig)."""
 
