@@ -114,7 +114,7 @@ class ArrayFile:
         return found
 
     def read(self, name: str) -> np.ndarray:
-        """The array ``name``, as a copy of its own that outlives the file."""
+        """The array ``name``: writable memory of its own that outlives the file."""
         if name not in self.shapes:
             raise self.fault(f"array {name!r} is missing")
         self.dtype(name)

@@ -104,10 +104,10 @@ def _unpack(tree: Any, file: ArrayFile, depth: int) -> Any:
         case ["float", "nan" | "inf" | "-inf" as text]:
             return float(text)
         case ["array", str(name)]:
-            return file.read(name).copy()
+            return file.read(name)
         case ["tensor", str(name)]:
             import torch
 
-            return torch.from_numpy(file.read(name).copy())
+            return torch.from_numpy(file.read(name))
         case _:
             raise file.fault("its tree of values is damaged")

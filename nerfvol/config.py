@@ -37,7 +37,7 @@ def seconds(value: Any) -> Any:
         duration = float(number) * _UNITS[unit]
     except ValueError:
         duration = math.nan
-    if isinstance(value, bool) or not (math.isfinite(duration) and duration > 0):
+    if not (math.isfinite(duration) and duration > 0):
         raise ValueError(f"expected a duration such as 120s, 5m or 1h, got {value!r}")
     return duration
 

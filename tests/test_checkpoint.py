@@ -27,6 +27,8 @@ def same(a, b):
         return isinstance(b, dict) and list(a) == list(b) and all(same(a[k], b[k]) for k in a)
     if isinstance(a, (list, tuple)):
         return isinstance(b, list) and len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, np.generic):
+        a = a.item()
     return type(a) is type(b) and (a == b or a != a and b != b)
 
 
@@ -34,7 +36,8 @@ def example_state():
     averages = {0: {"exp_avg": torch.arange(6.0).reshape(2, 3)}}
     optimizer_like = {"state": averages, "groups": [{"lr": 0.1, "params": [0]}]}
     return {
-        "step": 7, "name": "é", "none": None, "flag": True, "big": 2**120, "loss": math.inf, "nan": math.nan,
+        "step": 7, "name": "é", "none": None, "flag": True, "numpy_flag": np.bool_(False), "n": np.int16(4),
+        "big": 2**120, "loss": math.inf, "nan": math.nan,
         "optimizer": optimizer_like, "rng": torch.get_rng_state(), "pair": (1, 2.5),
         "scalar": torch.tensor(3, dtype=torch.int64), "empty": np.zeros((0, 4), np.float16),
         "strided": np.arange(12, dtype=np.int16).reshape(3, 4)[:, ::2], "mask": np.array([True, False]),
@@ -134,6 +137,7 @@ HOSTILE = {
     "unknown tag": (document(["dict", [["a", ["eval", "1"]]]]), b""),
     "tree is a number": (document(3), b""),
     "bare dict in the tree": (document(["dict", [["a", {"x": 1}]]]), b""),
+    "key that is a list": (document(["dict", [[["x"], 1]]]), b""),
     "dict entry of three": (document(["dict", [["a", 1, 2]]]), b""),
     "nested too deep": (document(deep(200)), b""),
     "header is no json": (b"{" + b"x" * 50, b""),
@@ -193,6 +197,15 @@ def test_expect_names_what_came(tmp_path):
                 file.expect("x", dtype, shape)
         with pytest.raises(InputError, match="'y' is missing"):
             file.expect("y", "int32", (None,))
+
+
+def test_arrays_lie_aligned_to_their_elements(tmp_path):
+    write_arrays(tmp_path / "a", {"a": np.zeros(3, np.uint8), "b": np.zeros(2), "c": np.zeros(5, np.int16)}, {})
+    content = (tmp_path / "a").read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    for name, size in (("a", 1), ("b", 8), ("c", 2)):
+        assert (8 + length + header[name]["data_offsets"][0]) % size == 0
 
 
 def test_unsupported_dtype_is_not_written(tmp_path):

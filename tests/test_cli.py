@@ -182,6 +182,7 @@ octree:
   downscales: [2, 1, 1]
   until: [0.2, 0.5, 1.0]
   tiles: [16, 16, 16]
+  prunes: [1, 1, 1]
 """
 
 

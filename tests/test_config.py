@@ -53,6 +53,7 @@ class Settings:
     folder: Path = Path(".")
     names: list[str] = dataclasses.field(default_factory=list)
     section: Section = dataclasses.field(default_factory=Section)
+    stage: Stage = Stage()
 
 
 def build(mapping, *more):
@@ -63,6 +64,11 @@ def test_layers_override_key_by_key():
     settings = build({"section": {"rate": 0.1, "levels": 5}, "data": "x"}, ({"section": {"levels": 7}}, "command line"))
     assert (settings.data, settings.section.rate, settings.section.levels, settings.mode) == ("x", 0.1, 7, "direct")
     assert Settings().section.levels == 3  # defaults are not shared
+
+
+def test_a_frozen_section_given_as_default_is_not_changed_for_all():
+    assert build({"stage": {"resolution": 8}}).stage == Stage(8)
+    assert Settings().stage == Stage(64)
 
 
 def test_every_kind_of_value():

@@ -78,6 +78,16 @@ def test_killed_writer_leaves_the_old_file(tmp_path):
     assert target.read_bytes() == b"old"
 
 
+def test_synced_before_it_is_renamed(tmp_path, monkeypatch):
+    """A rename that reaches the disk before the data would leave an empty file after a power cut."""
+    order = []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda fd: order.append("sync") or sync(fd))
+    monkeypatch.setattr(os, "replace", lambda a, b: order.append("rename") or replace(a, b))
+    files.write_bytes(tmp_path / "a.bin", b"x")
+    assert order == ["sync", "rename", "sync"]  # the data, the name, the folder that holds the name
+
+
 def test_json_round_trip_and_nan_refused(tmp_path):
     files.write_json(tmp_path / "a.json", {"psnr": 30.5, "rows": [1, 2]})
     assert files.read_json(tmp_path / "a.json") == {"psnr": 30.5, "rows": [1, 2]}
