@@ -78,10 +78,11 @@ class OccupancyGrid:
         r = self.resolution
         thickness = self.sigmas.view(self.n_cubes, -1) * self.cell_edges[:, None]
         cells = (thickness > self.threshold).view(self.n_cubes, 1, r, r, r)
-        for k in range(1, self.n_cubes):  # the inside of a larger cube is what the smaller one knows
-            cells[k, :, r // 4 : r - r // 4, r // 4 : r - r // 4, r // 4 : r - r // 4] |= (
-                functional.max_pool3d(cells[k - 1].float(), 2) > 0
-            )
+        inner = slice(r // 4, r - r // 4)
+        for k in range(
+            1, self.n_cubes
+        ):  # points are noted in the smallest cube: the larger ones' middle is its summary
+            cells[k, :, inner, inner, inner] = functional.max_pool3d(cells[k - 1].float(), 2) > 0
         self.occupied = cells.reshape(-1)
         pooled = functional.max_pool3d(cells.float(), _POOL)
         # One cell of dilation: a group of steps is tested at its middle and is never longer than two coarse cells.
