@@ -116,7 +116,8 @@ class OctreeTrainer:
         for name in ("stage", "first_stage", "step_count", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
         self.rich, self.plain = Cursor(**state["rich"]), Cursor(**state["plain"])
-        self.bank = None
+        # The bank says when enough was seen to prune: where it stood before, it must stand at once.
+        self.bank = None if self.step_count == 0 else self._make_bank()
 
     def step(self, progress: float) -> ops.StepReport:
         """One step at ``progress`` in [0, 1] of the run."""
@@ -127,7 +128,7 @@ class OctreeTrainer:
                 self.next_stage()
         self._prune_inside_stage(progress)
         if self.bank is None:
-            self.bank = TileBank(self.dataset, self.background, c.downscales[self.stage])
+            self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
         options = ops.LossOptions(self.background, c.colour * fade, c.distortion * fade, c.early_stop_eps)
         late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
@@ -138,6 +139,9 @@ class OctreeTrainer:
         self.step_count += 1
         self.tiles_seen += c.tiles[self.stage]
         return report
+
+    def _make_bank(self) -> TileBank:
+        return TileBank(self.dataset, self.background, self.config.downscales[self.stage])
 
     def next_stage(self) -> None:
         c = self.config
@@ -169,6 +173,12 @@ class OctreeTrainer:
     def prune(self) -> None:
         self.tiles_seen = 0
         keep = self.state.max_weight >= self.config.prune_weight
+        if not keep.any():
+            raise InputError(
+                f"the octree collapsed to empty space at step {self.step_count}: no training ray needs any of it; check "
+                "that --background is the images' background and that the scene bounds contain the object, or lower "
+                "octree.colour and octree.distortion"
+            )
         self.footprint = self.state.footprint[keep]
         self._change(*self.octree.prune(keep))
 
