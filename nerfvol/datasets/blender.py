@@ -60,9 +60,10 @@ def _read_single(path: Path, split: str) -> Listing:
     frames, hint = _parse(data, path)
     present = [frame for frame in frames if frame.path is not None]
     missing = [frame for frame in frames if frame.path is None]
-    named = {s: data[f"{s}_filenames"] for s in _SPLITS if data.get(f"{s}_filenames")}
-    if "train" in named and ("val" in named or "test" in named):
-        wanted = named.get(split) or named.get("test") or named.get("val")
+    named = _named_splits(data, path)
+    held = named.get("test", named.get("val"))
+    if "train" in named and held is not None:
+        wanted = named.get(split, held)
         chosen = [f for f in present if f.listed in wanted]
         training = [f for f in present if f.listed in named["train"]]
         return Listing(chosen + [f for f in missing if f.listed in wanted], training, path, hint)
@@ -70,6 +71,19 @@ def _read_single(path: Path, split: str) -> Listing:
         return Listing(frames, frames, path, hint)
     chosen, training, sentence = hold_out(present, split)
     return Listing(chosen + missing, training, path, hint, [sentence])
+
+
+def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
+    """nerfstudio's train_filenames, val_filenames and test_filenames, those that are there."""
+    named = {}
+    for split in _SPLITS:
+        names = data.get(f"{split}_filenames")
+        if not names:
+            continue
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{path}: {split}_filenames must be a list of file names, got {names!r:.60}")
+        named[split] = set(names)
+    return named
 
 
 def _read_file(path: Path) -> tuple[list[Frame], BoundsHint]:
@@ -137,9 +151,9 @@ def _calibration(data: Mapping[str, Any]) -> Calibration:
     if unsupported:
         raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
     fisheye = model in _FISHEYE_MODELS or data.get("is_fisheye") is True
-    coefficients = [_number(data, key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2")]
+    k1, k2, k3, k4, p1, p2 = (_number(data, key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if fisheye:
-        coefficients[4:] = [0.0, 0.0]  # the model has no tangential part; exporters write zeros or leftovers there
+        p1 = p2 = 0.0  # the model has no tangential part; exporters write zeros or leftovers there
     degrees = {key: _number(data, key) for key in ("x_fov", "y_fov")}
     angles = [None if v is None else math.radians(v) for v in degrees.values()]
     width, height = (_size(data, key) for key in ("w", "h"))
@@ -147,7 +161,7 @@ def _calibration(data: Mapping[str, Any]) -> Calibration:
         width=width, height=height, fx=_number(data, "fl_x"), fy=_number(data, "fl_y"),
         angle_x=_number(data, "camera_angle_x") if angles[0] is None else angles[0],
         angle_y=_number(data, "camera_angle_y") if angles[1] is None else angles[1],
-        cx=_number(data, "cx"), cy=_number(data, "cy"), distortion=tuple(coefficients), fisheye=fisheye,
+        cx=_number(data, "cx"), cy=_number(data, "cy"), distortion=(k1, k2, k3, k4, p1, p2), fisheye=fisheye,
     )
 
 

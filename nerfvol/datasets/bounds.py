@@ -53,9 +53,14 @@ def _half_angle_tangent(camera: Camera) -> float:
     return max(0.5 * intrinsics.width / intrinsics.fx, 0.5 * intrinsics.height / intrinsics.fy)
 
 
+def bounds_of_box(box: NDArray[np.float64], has_alpha: bool) -> SceneBounds:
+    """A stated region of detail (2, 3), with the surroundings that photographs need."""
+    surroundings = cube(box.mean(axis=0), BACKGROUND_FACTOR * float((box[1] - box[0]).max()) / 2)
+    return SceneBounds(box, None if has_alpha else surroundings, has_alpha)
+
+
 def _around(center: NDArray[np.float64], half: float, has_alpha: bool) -> SceneBounds:
-    background = None if has_alpha else cube(center, BACKGROUND_FACTOR * half)
-    return SceneBounds(cube(center, half), background, has_alpha)
+    return bounds_of_box(cube(center, half), has_alpha)
 
 
 def estimate_bounds(
@@ -73,10 +78,7 @@ def estimate_bounds(
     """
     hint = hint or BoundsHint()
     if hint.aabb is not None:
-        box = SceneBounds(hint.aabb, None, has_alpha)
-        half = float((box.aabb[1] - box.aabb[0]).max() / 2)
-        background = None if has_alpha else cube(box.center, BACKGROUND_FACTOR * half)
-        return SceneBounds(box.aabb, background, has_alpha), "scene bounds: the aabb of the file"
+        return bounds_of_box(hint.aabb, has_alpha), "scene bounds: the aabb of the file"
     positions = np.stack([camera.position for camera in cameras])
     center, certainty = focus_point(cameras)
     distances = np.linalg.norm(positions - center, axis=1)

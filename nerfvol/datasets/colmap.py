@@ -95,10 +95,14 @@ def _calibration(model: str, width: int, height: int, parameters: tuple[float, .
     if not all(np.isfinite(parameters)) or min(width, height) < 1:
         raise InputError(f"a camera must have a size and finite parameters, got {width}x{height} and {parameters}")
     focal = values.get("f")
+
+    def get(key: str) -> float:
+        return values.get(key, 0.0)
+
     return Calibration(
         width=width, height=height, fx=values.get("fx", focal), fy=values.get("fy", focal),
         cx=values["cx"], cy=values["cy"],
-        distortion=tuple(values.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2")),
+        distortion=(get("k1"), get("k2"), get("k3"), get("k4"), get("p1"), get("p2")),
         fisheye="FISHEYE" in model, resizable=True,
     )
 

@@ -14,6 +14,7 @@ from nerfvol.cameras import Intrinsics
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.images import SUFFIXES
 from nerfvol.errors import InputError
+from nerfvol.lens import Coefficients
 
 HOLD_OUT_EVERY = 8
 
@@ -34,7 +35,7 @@ class Calibration:
     angle_y: float | None = None
     cx: float | None = None
     cy: float | None = None
-    distortion: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     fisheye: bool = False
     resizable: bool = False
 
@@ -43,9 +44,9 @@ class Calibration:
         sx, sy = self._resize(width, height)
         fx = self.fx * sx if self.fx is not None else _focal(self.angle_x, width)
         fy = self.fy * sy if self.fy is not None else _focal(self.angle_y, height)
-        if fx is None and fy is None:
-            raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
         fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)  # square pixels where only one is given
+        if fx is None or fy is None:
+            raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
         cx = 0.5 * width if self.cx is None else self.cx * sx
         cy = 0.5 * height if self.cy is None else self.cy * sy
         return Intrinsics(width, height, fx, fy, cx, cy, *self.distortion, fisheye=self.fisheye)
@@ -78,6 +79,13 @@ class Frame:
     path: Path | None
     c2w: NDArray[np.float64]
     calibration: Calibration
+
+    @property
+    def file(self) -> Path:
+        """The image's path; InputError where it is missing."""
+        if self.path is None:
+            raise InputError(f"{self.listed}: there is no such image")
+        return self.path
 
 
 @dataclass(eq=False)

@@ -106,7 +106,7 @@ def _area_sums(plane: NDArray[np.unsignedinteger], k: int) -> NDArray[np.uint32]
     return total
 
 
-def _divide(total: NDArray[np.uint32], by: NDArray[np.uint32] | int) -> UInt8:
+def _divide(total: NDArray[np.uint32], by: NDArray[np.uint32] | np.uint32) -> UInt8:
     """total / by rounded half up."""
     return ((total + by // np.uint32(2)) // by).astype(np.uint8)
 
@@ -161,5 +161,5 @@ def composite(image: UInt8, background: Sequence[float]) -> NDArray[np.float32]:
     values = image.astype(np.float32) * np.float32(1 / 255)
     if image.shape[2] == 3:
         return values
-    alpha = values[..., 3:]
-    return values[..., :3] * alpha + (1 - alpha) * np.asarray(background, dtype=np.float32)
+    behind = np.asarray(background, dtype=np.float32)
+    return behind + values[..., 3:] * (values[..., :3] - behind)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from nerfvol.cameras import Camera
 from nerfvol.datasets.blender import is_transforms_folder, read_transforms
-from nerfvol.datasets.bounds import cube, estimate_bounds, require_seen
+from nerfvol.datasets.bounds import bounds_of_box, estimate_bounds, require_seen
 from nerfvol.datasets.colmap import find_model, read_colmap
 from nerfvol.datasets.dataset import Dataset, SceneBounds, check_box
 from nerfvol.datasets.frames import Frame, Listing, listed_names
@@ -46,13 +46,13 @@ def load_dataset(
     listing = _read_listing(Path(path), split)
     messages = list(listing.messages)
     frames = _present(listing, messages)
-    sizes = map_threads(lambda frame: image_size(frame.path), frames, threads)
+    sizes = map_threads(lambda frame: image_size(frame.file), frames, threads)
     _require_one_size(frames, sizes)
     full_size = [_camera(frame, size, listing.source) for frame, size in zip(frames, sizes, strict=True)]
     cameras = [camera.scaled(downscale) for camera in full_size]
     _require_memory(cameras, downscale)
 
-    images = map_threads(lambda frame: area_average(read_image(frame.path), downscale), frames, threads)
+    images = map_threads(lambda frame: area_average(read_image(frame.file), downscale), frames, threads)
     for frame, image, camera in zip(frames, images, cameras, strict=True):
         if image.shape[:2] != (camera.intrinsics.height, camera.intrinsics.width):
             raise InputError(f"{frame.path}: the image is not of the size its header declares")
@@ -149,17 +149,7 @@ def _bounds(
     if isinstance(override, SceneBounds):
         return override, "scene bounds: as given"
     if override is not None:
-        box = check_box(override, "the scene's aabb")
-        half = float((box[1] - box[0]).max() / 2)
-        return SceneBounds(box, None if has_alpha else cube(box.mean(axis=0), 16 * half), has_alpha), (
-            "scene bounds: the aabb as given"
-        )
-    sizes: dict[Path, tuple[int, int]] = {}
-    cameras = []
-    for frame in training:
-        stated = (frame.calibration.width, frame.calibration.height)
-        if None in stated or frame.calibration.resizable:
-            sizes[frame.path] = image_size(frame.path)
-        cameras.append(_camera(frame, sizes.get(frame.path, stated), listing.source))
+        return bounds_of_box(check_box(override, "the scene's aabb"), has_alpha), "scene bounds: the aabb as given"
+    cameras = [_camera(frame, image_size(frame.file), listing.source) for frame in training]
     return estimate_bounds(cameras, has_alpha, listing.hint)
 

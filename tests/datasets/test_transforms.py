@@ -228,6 +228,7 @@ BAD_JSON = {
     "unknown lens": (put("camera_model", "EQUIRECTANGULAR"), "'EQUIRECTANGULAR' is not supported"),
     "lens by another name": (put("equirectangular", True), "equirectangular is not supported"),
     "lens that folds over": (put("k1", -9.0), "cannot be undone"),
+    "names that are no list": (put("train_filenames", "images/view_003.png"), "train_filenames must be a list"),
     "negative aabb_scale": (put("aabb_scale", -1), "aabb_scale must be positive"),
     "flat aabb": (put("aabb", [[0, 0, 0], [1, 1, 0]]), "aabb must be finite with its first corner below"),
     "aabb of words": (put("aabb", [["a", 0, 0], [1, 1, 0]]), "aabb must be two corners"),
