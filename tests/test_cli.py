@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -15,7 +14,7 @@ from conftest import make_sphere_octree, write_scene
 import nerfvol
 from nerfvol import cli, runs
 from nerfvol.errors import InputError
-from nerfvol.octree_io import load_octree, save_octree
+from nerfvol.octree_io import save_octree
 
 ROOT = Path(nerfvol.__file__).parents[1]
 
@@ -218,56 +217,6 @@ def test_train_eval_render_end_to_end(tmp_path, trained, command):
     picture = np.asarray(Image.open(tmp_path / "views" / "0000.png"))
     assert picture.shape[:2] == (40, 40)  # the size of the training images
     assert (picture != 255).any(axis=-1).mean() > 0.1  # the orbit looks at the scene
-
-
-def assert_same_octree(run_a, run_b):
-    """Bitwise."""
-    a, b = (load_octree(folder / "octree.safetensors")[0] for folder in (run_a, run_b))
-    assert np.array_equal(a.leaf_mask, b.leaf_mask) and np.array_equal(a.values, b.values)
-
-
-def test_same_seed_same_octree(tmp_path, trained, tiny_scene):
-    """Whatever the number of threads."""
-    (tmp_path / "tiny.yaml").write_text(TINY)
-    done = run(
-        "train", "--data", tiny_scene, "--out", tmp_path / "run", "--config", tmp_path / "tiny.yaml", "--seed", 3,
-        "--threads", 2,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert_same_octree(trained, tmp_path / "run")
-
-
-def start_and_wait_for_checkpoint(folder, scene, *more):
-    """A training process of its own that has written its first checkpoint."""
-    (folder / "tiny.yaml").write_text(TINY)
-    command = [sys.executable, "-m", "nerfvol.cli", "train", "--data", scene, "--out", folder / "run"]
-    command += ["--config", folder / "tiny.yaml", "--seed", "3", *more]
-    process = subprocess.Popen(list(map(str, command)), cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
-    deadline = time.monotonic() + 60
-    while not (folder / "run" / "checkpoint.safetensors").exists():
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.01)
-    return process
-
-
-def test_killed_and_resumed_gives_the_same_octree(tmp_path, trained, tiny_scene):
-    """kill -9 loses no file, and --resume comes to the numbers of a run that was left alone."""
-    process = start_and_wait_for_checkpoint(tmp_path, tiny_scene)
-    process.kill()
-    process.communicate()
-    assert not (tmp_path / "run" / "octree.safetensors").exists()
-    done = run("train", "--out", tmp_path / "run", "--resume")  # data and settings from the run folder
-    assert done.returncode == 0, done.stderr
-    assert_same_octree(trained, tmp_path / "run")
-    assert not [path for path in (tmp_path / "run").iterdir() if ".tmp" in path.name]
-
-
-def test_interrupt_saves_and_says_how_to_go_on(tmp_path, tiny_scene):
-    process = start_and_wait_for_checkpoint(tmp_path, tiny_scene, "--set", "octree.steps=1000000")
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130 and err == b"nerfvol: interrupted\n"
-    assert b"saved at step" in out and b"--resume" in out
 
 
 def test_config_of_a_run_reproduces_it_as_a_file(tmp_path, trained):
