@@ -189,13 +189,23 @@ def render_field(
     parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for o, d in zip(rays_o.split(chunk), rays_d.split(chunk), strict=True):
         samples = find_samples(o, d)
-        _, rgb, result = shade(field, samples, o, d)
+        rgb, result = _shade_in_pieces(field, samples, o, d)
         middle = (samples.t_starts + samples.t_ends) / 2
         summed = accumulate(result.weights, torch.cat([rgb, middle[:, None]], -1), samples.ray_indices, len(o))
         colour = (summed[:, :3] + result.trans_final[:, None] * back).clamp(0, 1)
         parts.append((colour, 1 - result.trans_final, summed[:, 3]))
     rgb, opacity, depth = (torch.cat(column) for column in zip(*parts, strict=True))
     return {"rgb": rgb, "opacity": opacity, "depth": depth}
+
+
+def _shade_in_pieces(
+    field: RadianceField, samples: Samples, rays_o: Tensor, rays_d: Tensor, piece: int = 65536
+) -> tuple[Tensor, Composite]:
+    """Colours and compositing, the field evaluated for ``piece`` samples at a time: a ray may have hundreds of them."""
+    positions, viewdirs = samples.positions(rays_o, rays_d), rays_d[samples.ray_indices]
+    parts = [field(p, v) for p, v in zip(positions.split(piece), viewdirs.split(piece), strict=True)]
+    sigmas, rgb = (torch.cat(column) for column in zip(*parts, strict=True))
+    return rgb, composite_packed(sigmas, samples.t_ends - samples.t_starts, samples.ray_indices, len(rays_o))
 
 
 class FieldTrainer:
