@@ -1,6 +1,7 @@
 """Octree files: exact or within the codec's stated bounds, and nothing that bytes can say does more than be refused."""
 
 import json
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -237,6 +238,7 @@ def test_hostile_documents_and_arrays(tmp_path, case):
 COMPACT_HOSTILE = {
     "bomb": (dict(code000__low=BOMB), "does not hold one code"),
     "stream cut short": (dict(code001__low=lambda a: a[:-8]), "does not hold|damaged"),
+    "checksum cut off": (dict(code001__low=lambda a: a[:-2]), "does not hold"),
     "too few codes": (dict(code002__high=np.frombuffer(zlib.compress(b"\0" * 5), np.uint8)), "does not hold one code"),
     "noise": (dict(code003__low=lambda a: a[::-1]), "damaged|does not hold"),
     "missing plane": (dict(code004__high=None), "missing"),
@@ -262,6 +264,19 @@ def test_hostile_compact_files(tmp_path, case):
     edited(path, "compact", **changes)
     with pytest.raises(InputError, match=reason):
         load_octree(path)
+
+
+def test_a_bomb_costs_no_memory(tmp_path):
+    """50 kB that claim to be 50 MB: reading stops at one byte more than there are vertices."""
+    path = tmp_path / "bad.safetensors"
+    edited(path, "compact", code000__low=BOMB)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError):
+            load_octree(path)
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_too_deep_an_octree_is_refused(tmp_path):
