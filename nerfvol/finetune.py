@@ -16,7 +16,7 @@ import numpy as np
 from nerfvol.datasets import Dataset, SceneBounds
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
-from nerfvol.octree import Octree
+from nerfvol.octree import Octree, Transfer
 from nerfvol.tiles import Cursor, TileBank
 
 
@@ -32,17 +32,18 @@ class OctreeConfig:
     """Image downscale of each stage."""
     until: list[float] = field(default_factory=lambda: [0.005, 0.01, 0.03, 0.10, 0.35, 1.0])
     """Share of progress at which each stage ends."""
-    tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 256, 256, 512])
-    """8x8 tiles in a batch, per stage."""
-    prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 1, 1, 2])
+    tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 320, 320, 320])
+    """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
+    prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 2, 2, 2])
     """Prunings inside each stage, evenly spaced."""
     coverage: float = 0.5
+    """Pruning waits until this share of the tiles that are not plain background was seen (at most 20000 tiles)."""
     sh_degree: int = 1
     rich_share: float = 0.8
     """Share of a batch drawn from tiles that are not plain background."""
     colour: float = 0.03
     """Weight of the per-sample colour term at the start."""
-    distortion: float = 0.01
+    distortion: float = 0.05
     """Weight of the distortion term at the start."""
     regulariser_decay: float = 0.1
     """Both weights shrink to this factor over the run."""
@@ -57,8 +58,12 @@ class OctreeConfig:
     prune_weight: float = 0.005
     """Leaves whose largest rendering weight since the last pruning is below are removed."""
     subdivide_pixels: float = 1.0
-    """Leaves are split only while they are larger than this many pixels in some view."""
-    early_stop_eps: float = 1e-3
+    """From level ``choosy_from`` on, leaves are split only while they are larger than this many pixels in some view ..."""
+    subdivide_error: float = 0.97
+    """... and only the fewest leaves that hold this share of the squared error."""
+    choosy_from: int = 9
+    early_stop_eps: float = 4e-3
+    """Training rays end when their transmittance falls below."""
 
 
 class OctreeTrainer:
@@ -70,16 +75,20 @@ class OctreeTrainer:
             if len(getattr(config, name)) != n:
                 raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
-        self.octree = octree if octree is not None else thin_octree(dataset.scene, config.levels[0], config.sh_degree)
+        self.octree = octree if octree is not None else self._thin_start()
         self.state = ops.TrainState(self.octree)
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
-        self.stage = 0 if octree is None else first_stage(config, octree)
+        self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
         self.step_count = 0
         self.rich, self.plain = Cursor(), Cursor()
         self.prunings = 0
         self.tiles_seen = 0
         self.bank: TileBank | None = None
+
+    def _thin_start(self) -> Octree:
+        cameras = np.stack([camera.position for camera in self.dataset.cameras])
+        return thin_octree(self.dataset.scene, self.config.levels[0], self.config.sh_degree, cameras)
 
     @property
     def _start(self) -> float:
@@ -144,15 +153,18 @@ class OctreeTrainer:
         return TileBank(self.dataset, self.background, self.config.downscales[self.stage])
 
     def next_stage(self) -> None:
+        """Prunes, splits the leaves that the next stage wants finer, and turns to its images."""
         c = self.config
         old, self.stage, self.prunings = self.stage, self.stage + 1, 0
-        self.prune()
-        while self.octree.max_level < c.levels[self.stage]:
-            split = (self.octree.leaf_level < c.levels[self.stage])
-            if c.levels[self.stage] > 8:
-                ratio = c.downscales[old] / c.downscales[self.stage]
-                split &= self.footprint * ratio > c.subdivide_pixels
-            self._change(*self.octree.subdivide(split))
+        error, footprint = self.prune()
+        footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
+        wanted = c.levels[self.stage]
+        for _ in range(wanted - min(c.levels[old], wanted)):
+            split = self.octree.leaf_level < leaf_limits(self.octree, self.dataset.scene, wanted)
+            if wanted >= c.choosy_from:
+                split &= (footprint > c.subdivide_pixels) & holds_share(error, c.subdivide_error)
+            transfer = self._change(*self.octree.subdivide(split))
+            error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
             self.rich, self.plain = Cursor(), Cursor()
@@ -170,7 +182,8 @@ class OctreeTrainer:
             self.prune()
             self.prunings += 1
 
-    def prune(self) -> None:
+    def prune(self) -> tuple[np.ndarray, np.ndarray]:
+        """Removes leaves that no ray needed; error and footprint of those that stay."""
         self.tiles_seen = 0
         keep = self.state.max_weight >= self.config.prune_weight
         if not keep.any():
@@ -179,29 +192,71 @@ class OctreeTrainer:
                 "that --background is the images' background and that the scene bounds contain the object, or lower "
                 "octree.colour and octree.distortion"
             )
-        self.footprint = self.state.footprint[keep]
+        error, footprint = self.state.error[keep], self.state.footprint[keep]
         self._change(*self.octree.prune(keep))
+        return error, footprint
 
-    def _change(self, octree: Octree, transfer) -> None:
-        moments = transfer.vertices(self.state.moments)
-        footprint = getattr(self, "footprint", None)
-        self.octree = octree
-        self.state = ops.TrainState(octree, moments)
-        if footprint is not None and transfer.parent is not None and len(footprint) != octree.n_leaves:
-            self.footprint = footprint[transfer.parent] / 2
+    def _change(self, octree: Octree, transfer: Transfer) -> Transfer:
+        self.octree, self.state = octree, ops.TrainState(octree, transfer.vertices(self.state.moments))
+        return transfer
 
 
-def first_stage(config: OctreeConfig, octree: Octree) -> int:
+def holds_share(error: np.ndarray, share: float) -> np.ndarray:
+    """The fewest entries of ``error`` (n,) that together hold ``share`` of its sum: (n,) bool."""
+    order = np.argsort(-error, kind="stable")
+    held = np.cumsum(error[order], dtype=np.float64)
+    chosen = np.zeros(len(error), dtype=bool)
+    chosen[order[: 1 + np.searchsorted(held, share * held[-1])]] = True
+    return chosen
+
+
+def first_stage(config: OctreeConfig, octree: Octree, scene: SceneBounds) -> int:
     """The first stage whose finest level is the octree's, or the last one."""
-    reached = [i for i, level in enumerate(config.levels) if level >= octree.max_level]
+    finest = octree.max_level - n_shells(scene)
+    reached = [i for i, level in enumerate(config.levels) if level >= finest]
     return reached[0] if reached else len(config.levels) - 1
 
 
-def thin_octree(scene: SceneBounds, level: int, sh_degree: int) -> Octree:
-    """A uniform, nearly transparent octree over the region of detail."""
+def n_shells(scene: SceneBounds) -> int:
+    """How often the detail cube must double to hold the surroundings; 0 where the background is not part of the scene."""
+    if scene.background_cube is None:
+        return 0
+    detail, around = ((box[1] - box[0]).max() for box in (scene.aabb, scene.background_cube))
+    return max(0, int(np.ceil(np.log2(around / detail) - 1e-6)))
+
+
+def thin_octree(scene: SceneBounds, level: int, sh_degree: int, cameras: np.ndarray) -> Octree:
+    """A nearly transparent octree: 2**level cells along the detail cube, then shells of doubling cells to the horizon.
+
+    Each shell reaches twice as far as the one inside it with cells twice as large, so that cells look about equally
+    large from the middle. In scenes with surroundings the space close to ``cameras`` (n, 3) is left empty: what stands
+    right before one lens is seen by no other and would only explain that one picture.
+    """
     lo, hi = scene.aabb
-    size = float((hi - lo).max())
-    n = 2**level
-    ijk = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    detail, shells, n = float((hi - lo).max()), n_shells(scene), 2**level
+    size = detail * 2**shells
     origin = (lo + hi) / 2 - size / 2
-    return Octree.from_leaves(np.full(len(ijk), level), ijk, origin, size, sh_degree, density_scale=300 / size)
+    cube = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    levels, cells = [], []
+    for shell in range(shells + 1):
+        inner = ((cube >= n // 4) & (cube < n - n // 4)).all(1)
+        ijk = cube if shell == 0 else cube[~inner]
+        levels.append(np.full(len(ijk), level + shells - shell))
+        cells.append(ijk + (2 ** (level + shells - shell) - n) // 2)
+    levels, cells = np.concatenate(levels), np.concatenate(cells)
+    if shells:
+        centers = origin + (cells + 0.5) * (size / 2.0**levels)[:, None]
+        near = 0.1 * np.median(np.linalg.norm(cameras - scene.center, axis=1))
+        far_enough = np.ones(len(levels), dtype=bool)
+        for camera in cameras:
+            far_enough &= ((centers - camera) ** 2).sum(1) > near**2
+        levels, cells = levels[far_enough], cells[far_enough]
+    return Octree.from_leaves(levels, cells, origin, size, sh_degree, density_scale=300 / detail)
+
+
+def leaf_limits(octree: Octree, scene: SceneBounds, level: int) -> np.ndarray:
+    """The finest level that each leaf may have, (n_leaves,), where the detail cube has 2**level cells."""
+    shells = n_shells(scene)
+    half = (scene.aabb[1] - scene.aabb[0]).max() / 2
+    distance = np.abs(octree.leaf_centers() - scene.center).max(1) / half
+    return level + shells - np.ceil(np.log2(np.maximum(distance, 1))).astype(np.int64)

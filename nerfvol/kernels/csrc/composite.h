@@ -12,7 +12,7 @@
 
 namespace NERFVOL_ISA {
 
-// One segment: a ray in a leaf. After the adjoint `value` holds the gradient in the same four places.
+// One segment: a ray in a leaf.
 struct Hit {
     f4 value;                      // r, g, b (without 1/2), raw density
     float fx, fy, fz;              // place in the leaf

@@ -68,7 +68,9 @@ void render_packet(const Tree& tree, Packet& p, const RenderOptions& options, co
             state.trans[l] = after;
             if (extras) {
                 if (before > 0.5f && after <= 0.5f) {
-                    const float tau = std::log(before / after), f = tau > 0 ? std::log(2.0f * before) / tau : 0.0f;
+                    const float raw = x.raw[i];
+                    const float tau = x.length[i] * tree.density_scale * (raw < 1.0f ? std::exp(raw - 1.0f) : raw);
+                    const float f = tau > 0 ? std::log(2.0f * before) / tau : 0.0f;
                     median[l] = (s.middle[l] + (f - 0.5f) * s.length[l]) * tree.size;
                 }
                 if (out.normal) add_normal(rows, s.fx[l], s.fy[l], s.fz[l], w, normal[l]);

@@ -69,9 +69,12 @@ template <int B> inline f4 evaluate(const float* const* rows, f8 weights, const 
     keep_in_memory(w);
     f4 out{};
     for (int k = 0; k < B; ++k) {
-        f16 sum = w[0] * load<f16>(rows[0] + 16 * k);
-        for (int o = 1; o < 8; ++o) sum += w[o] * load<f16>(rows[o] + 16 * k);
-        sum *= load<f16>(basis + 16 * k);
+        f16 sum = w[0] * load<f16>(rows[0] + 16 * k), other = w[4] * load<f16>(rows[4] + 16 * k);
+        for (int o = 1; o < 4; ++o) {  // two chains: half the latency
+            sum += w[o] * load<f16>(rows[o] + 16 * k);
+            other += w[o + 4] * load<f16>(rows[o + 4] + 16 * k);
+        }
+        sum = (sum + other) * load<f16>(basis + 16 * k);
         const f16 q = quad_sums(sum);
         f4 rgb = __builtin_shufflevector(q, q, 0, 4, 8, 12);
         if (k > 0) {

@@ -22,10 +22,17 @@ using nerfvol::Loss;
 using nerfvol::Optimizer;
 using nerfvol::StepReport;
 
+// Gradient of the loss in the field at one hit: what phase 2 needs, and no more, since it crosses from cache to cache.
+struct PointGradient {
+    f4 value;                             // dL/d(r, g, b, raw density)
+    float fx, fy, fz;                     // place in the leaf
+    int32_t lane;
+};
+
 // What phase 1 leaves of one packet. Kept between steps to spare the allocations.
 struct PacketRecord {
-    std::unique_ptr<Hit[]> hits;
-    size_t n_hits = 0, capacity = 0;
+    std::unique_ptr<PointGradient[]> points;
+    size_t capacity = 0;
     std::vector<Visit> visits;
     std::vector<int32_t> first_hit;       // of each visit
     std::vector<int32_t> order;           // visits grouped by bucket (a visit that straddles stands in several groups)
@@ -33,15 +40,27 @@ struct PacketRecord {
     alignas(64) float basis[kTile * 64];  // rows of BasisRows, 16 * B floats each
     StepReport report;
 
+    void reserve(size_t n) {
+        if (n <= capacity) return;
+        capacity = n + n / 4;
+        points.reset(new PointGradient[capacity]);
+    }
+};
+
+// The hits of the packet in work. Reused by a thread, so that they stay in its cache.
+struct HitList {
+    std::unique_ptr<Hit[]> hits;
+    size_t size = 0, capacity = 0;
+
     Hit* append(size_t n) {
-        if (n_hits + n > capacity) {
-            capacity = std::max<size_t>(1024, 2 * (n_hits + n));
+        if (size + n > capacity) {
+            capacity = std::max<size_t>(4096, 2 * (size + n));
             std::unique_ptr<Hit[]> larger(new Hit[capacity]);
-            std::copy(hits.get(), hits.get() + n_hits, larger.get());
+            std::copy(hits.get(), hits.get() + size, larger.get());
             hits = std::move(larger);
         }
-        n_hits += n;
-        return hits.get() + n_hits - n;
+        size += n;
+        return hits.get() + size - n;
     }
 };
 
@@ -52,16 +71,17 @@ inline int bucket_shift(int64_t n_vertices) {
 }
 
 template <int B>
-void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, PacketRecord& rec) {
+void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, HitList& list,
+                    PacketRecord& rec) {
     Extinction x;
-    rec.n_hits = 0;
+    list.size = 0;
     rec.visits.clear();
     rec.first_hit.clear();
     start(state);
     march<B>(tree, p, basis, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const float* const* rows, const BasisRows<B>& b) {
         const int m = __builtin_popcountll(hits);
-        const size_t base = rec.n_hits;
-        Hit* h = rec.append(size_t(m));
+        const size_t base = list.size;
+        Hit* h = list.append(size_t(m));
         int i = 0;
         for (uint64_t rest = hits; rest; rest &= rest - 1, ++i) {
             const int l = __builtin_ctzll(rest);
@@ -145,12 +165,14 @@ inline void adjoint_of_loss(const Loss& loss, const PacketState& s, int64_t firs
     }
 }
 
-// Back to front: replaces each hit's value by dL/d(r, g, b, raw density).
-inline void backward_packet(PacketRecord& rec, Adjoint& a, float per_length) {
+// Back to front: dL/d(r, g, b, raw density) of each hit, into the record.
+inline void backward_packet(const HitList& list, PacketRecord& rec, Adjoint& a, float per_length) {
+    rec.reserve(list.size);
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
     for (size_t v = rec.visits.size(); v-- > 0;) {
         Visit& visit = rec.visits[v];
-        Hit* h = rec.hits.get() + rec.first_hit[v];
+        const Hit* h = list.hits.get() + rec.first_hit[v];
+        PointGradient* point = rec.points.get() + rec.first_hit[v];
         for (int i = 0; i < visit.n_hits; ++i) {
             const int l = h[i].lane;
             const float w = h[i].weight;
@@ -176,7 +198,7 @@ inline void backward_packet(PacketRecord& rec, Adjoint& a, float per_length) {
             }
             gradient[3] = (h[i].trans_after * q - a.behind[l]) * h[i].tau_slope;
             a.behind[l] += w * q;
-            h[i].value = gradient;
+            point[i] = {gradient, h[i].fx, h[i].fy, h[i].fz, h[i].lane};
             visit.error += w * a.error[l];
         }
     }
@@ -227,7 +249,7 @@ template <int B> struct Sums {
 
 template <int B> void add_visit(const Tree& tree, const PacketRecord& rec, int v, int bucket, int shift, int32_t* slots, Sums<B>& sums) {
     const Visit& visit = rec.visits[size_t(v)];
-    const Hit* h = rec.hits.get() + rec.first_hit[size_t(v)];
+    const PointGradient* h = rec.points.get() + rec.first_hit[size_t(v)];
     f16 corner[8][B];
     for (int o = 0; o < 8; ++o)
         for (int k = 0; k < B; ++k) corner[o][k] = f16{};
@@ -337,12 +359,13 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         basis.fill(p, tree.sh_degree);
         for (int l = 0; l < count; ++l) std::memcpy(rec.basis + 16 * B * l, basis.row[l], sizeof(basis.row[l]));
         PacketState state;
-        forward_packet<B>(tree, p, basis, options.early_stop_eps, state, rec);
+        static thread_local HitList list;
+        forward_packet<B>(tree, p, basis, options.early_stop_eps, state, list, rec);
         Adjoint adjoint;
-        rec.report = {0, 0, double(rec.n_hits)};
+        rec.report = {0, 0, double(list.size)};
         if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
         else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
-        backward_packet(rec, adjoint, 1.0f / tree.size);
+        backward_packet(list, rec, adjoint, 1.0f / tree.size);
         group_by_bucket(tree, shift, rec);
     });
 
@@ -353,9 +376,10 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
             for (int32_t k = rec.offset[bucket]; k < rec.offset[bucket + 1]; ++k) {
                 const int v = rec.order[size_t(k)];
                 const Visit& visit = rec.visits[size_t(v)];
-                if (k + 4 < rec.offset[bucket + 1]) {  // records lie scattered: ask for the ones to come
-                    const size_t next = size_t(rec.order[size_t(k) + 4]);
-                    __builtin_prefetch(rec.hits.get() + rec.first_hit[next]);
+                if (k + 3 < rec.offset[bucket + 1]) {  // records lie scattered: ask for the ones to come
+                    const size_t next = size_t(rec.order[size_t(k) + 3]);
+                    for (int j = 0; j < rec.visits[next].n_hits; j += 2)
+                        __builtin_prefetch(rec.points.get() + rec.first_hit[next] + j);
                     __builtin_prefetch(tree.corners + 8 * int64_t(rec.visits[next].leaf));
                 }
                 add_visit<B>(tree, rec, v, bucket, shift, sink.slots, sums);
