@@ -97,15 +97,24 @@ def unit_normal(image: Mapping[str, Float]) -> Float:
 
 
 def depth_range(octree: Octree, cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Nearest and farthest distance at which any of ``cameras`` can meet a leaf of ``octree``."""
-    centers, reach = octree.leaf_centers(), octree.leaf_sizes() * (0.5 * 3**0.5)
-    low, high = (centers - reach[:, None]).min(axis=0), (centers + reach[:, None]).max(axis=0)
-    near, far = np.inf, 0.0
-    for camera in cameras:
-        eye = camera.position
-        near = min(near, float(np.linalg.norm(eye - np.clip(eye, low, high))))
-        far = max(far, float(np.linalg.norm(np.maximum(np.abs(eye - low), np.abs(eye - high)))))
-    return near, far
+    """Nearest and farthest distance that a few of ``cameras`` see, to scale pictures of depth by.
+
+    The 1st and 99th percentile of small renders, a tenth of their distance farther apart: single floaters do not count.
+    Where nothing is seen, the distances at which leaves could be.
+    """
+    seen = []
+    for camera in cameras[:: max(1, len(cameras) // 4)]:
+        width = min(camera.intrinsics.width, 96)
+        small = camera.resized(width, max(1, round(camera.intrinsics.height * width / camera.intrinsics.width)))
+        image = render_image(octree, small, outputs=("depth", "opacity"))
+        seen.append(surface_depth(image)[image["opacity"] >= 0.5])
+    depths = np.concatenate(seen)
+    if not len(depths):
+        reach = octree.size * 3**0.5
+        distances = [float(np.linalg.norm(camera.position - octree.origin - octree.size / 2)) for camera in cameras]
+        return max(min(distances) - reach / 2, 0.0), max(distances) + reach / 2
+    near, far = (float(value) for value in np.percentile(depths, (1, 99)))
+    return max(near - 0.1 * (far - near), 0.0), far + 0.1 * (far - near)
 
 
 # ------------------------------------------------------------------ the command
