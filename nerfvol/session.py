@@ -12,7 +12,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -21,7 +21,7 @@ import numpy as np
 from nerfvol import pictures, runs
 from nerfvol.camera_paths import describe_orbit
 from nerfvol.cameras import Camera
-from nerfvol.checkpoint import save_checkpoint
+from nerfvol.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.config import Config
 from nerfvol.datasets import Dataset, load_dataset
 from nerfvol.datasets.images import composite_average
@@ -41,6 +41,12 @@ RUNNING = 0.98
 """Memory, per step, of the running error."""
 PREVIEW_WIDTH = 200
 """Most pixels across of a preview."""
+
+
+_STATE = {
+    "elapsed": float, "phase_started": float, "running": float, "log_bytes": int, "stages": dict, "steps": dict,
+    "trainer": dict,
+}  # fmt: skip
 
 
 class Phase(Protocol):
@@ -76,11 +82,25 @@ class Clock:
         return time.perf_counter() - self._zero
 
 
+def read_saved(path: Path) -> dict[str, Any]:
+    """The state in a run's checkpoint, with everything that a continuation looks up in it."""
+    state = load_checkpoint(path)
+    known = {"done": {"steps"}, "field": _STATE, "octree": _STATE}
+    phase = state.get("phase")
+    if not (isinstance(phase, str) and phase in known and set(known[phase]) <= state.keys()):
+        raise InputError(f"{path} is no checkpoint of a training run")
+    for name, kind in _STATE.items() if phase != "done" else ():
+        if not isinstance(state[name], kind):
+            raise InputError(f"{path} is damaged: its {name} is {state[name]!r}")
+    return state
+
+
 class Run:
     """A run's data, log, checkpoints and clock; nothing here changes a number of the result."""
 
     def __init__(self, config: Config, clock: Clock, saved: dict[str, Any] | None) -> None:
         self.config, self.clock, self.folder = config, clock, Path(config.out)
+        self.checkpoint = self.folder / runs.CHECKPOINT
         self.saved = saved or {"phase": "start", "log_bytes": 0, "stages": {}, "steps": {}}
         self.phase: str = self.saved["phase"]
         self.stages: dict[str, Any] = self.saved["stages"]
@@ -91,6 +111,7 @@ class Run:
         self.dataset = load_dataset(config.data, "train", config.downscale)
         for message in self.dataset.messages:
             print(message)
+        require_something(self.dataset, config.background)
         estimate = estimate_training(self.dataset, largest_octree(config.octree.levels), config.octree.sh_degree)
         require_memory(estimate)
         lens = self.dataset.cameras[0].intrinsics
@@ -104,12 +125,15 @@ class Run:
         """Begin the phase, or go on inside it where the checkpoint was written in it."""
         resumed = self.saved["phase"] == phase.name
         if resumed:
-            phase.trainer.load_state_dict(self.saved["trainer"])
+            try:
+                phase.trainer.load_state_dict(self.saved["trainer"])
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
+                raise InputError(f"{self.checkpoint} does not fit the {phase.name} of this run: {error}") from error
             self.phase_started, self.running = self.saved["phase_started"], self.saved["running"]
             print(f"resumed at step {phase.steps_done} of the {phase.name}")
         else:
             self.phase_started, self.running = self.clock.elapsed(), math.nan
-        self.phase = phase.name
+        self.phase, self.steps[phase.name] = phase.name, phase.steps_done
         self.saved = {"phase": "entered"}  # lets the old arrays go
         if not resumed:
             self.save(phase)
@@ -167,7 +191,7 @@ class Run:
             "running": self.running, "log_bytes": self._log.tell(), "stages": self.stages, "steps": self.steps,
             "trainer": phase.trainer.state_dict(),
         }  # fmt: skip
-        save_checkpoint(self.folder / runs.CHECKPOINT, state)
+        save_checkpoint(self.checkpoint, state)
         self._last_save = time.perf_counter()
 
     def preview(self, phase: Phase, moment: float) -> None:
@@ -177,6 +201,8 @@ class Run:
         truth = composite_average(image, self.config.background, k).astype(np.float32) / 255
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
         pictures.write_png(self.preview_folder / f"{phase.name}_{round(100 * moment):03d}.png", picture)
+        if phase.name == "octree" and 0.2 < moment < 1:
+            self._reserve = self._time_to_finish(phase)
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
@@ -214,15 +240,29 @@ class Run:
         orbit = describe_orbit(self.dataset.cameras, self.dataset.scene.aabb)
         return {"provenance": provenance, "background": list(config.background), "orbit": orbit}
 
-    def _time_to_finish(self) -> float:
-        """Seconds to keep for writing and scoring."""
+    def _time_to_finish(self, phase: Phase | None = None) -> float:
+        """Seconds to keep for writing and scoring, by doing it for one view; rendering is guessed without a phase."""
         if self.config.time_budget is None:
             return 0.0
-        image = self.held_out.composited(0, self.config.background)
         started = time.perf_counter()
+        image = self.held_out.composited(0, self.config.background)
         ssim(image, image)
-        view = time.perf_counter() - started + 0.15e-6 * image.size / 3
-        return min(2.0 + 1.2 * len(self.held_out) * view, RESERVE_SHARE * self.config.time_budget)
+        if phase is not None:
+            phase.picture(self.held_out.cameras[0])
+        view = time.perf_counter() - started + (0.15e-6 * image.size / 3 if phase is None else 0.0)
+        views = len(self.held_out) + (self.config.compare_views if self.stages else 0)
+        return min(2.0 + 1.1 * views * view, RESERVE_SHARE * self.config.time_budget)
+
+
+def require_something(dataset: Dataset, background: Sequence[float]) -> None:
+    """An InputError where every pixel of every picture has the background's colour: there is nothing to reconstruct."""
+    plain = np.round(np.asarray(background) * 255)
+    if all((composite_average(image, background, 1) == plain).all() for image in dataset.images):
+        colour = ",".join(f"{c:g}" for c in background)
+        raise InputError(
+            f"{dataset.source}: the training images are empty, nothing in them differs from the background {colour}; "
+            "check the images, or choose another --background"
+        )
 
 
 def some_views(dataset: Dataset, most: int) -> Dataset:

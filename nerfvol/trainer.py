@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from nerfvol import __version__, runs
 from nerfvol.cameras import Camera
-from nerfvol.checkpoint import load_checkpoint, save_checkpoint
+from nerfvol.checkpoint import save_checkpoint
 from nerfvol.config import Config
 from nerfvol.evaluate import evaluate_octree, score_views
 from nerfvol.files import write_json
@@ -30,7 +30,7 @@ from nerfvol.machine import describe_hardware, peak_memory
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree, save_octree
 from nerfvol.render import render_image
-from nerfvol.session import Clock, Run
+from nerfvol.session import Clock, Run, read_saved
 
 LOG_EVERY = 50
 """Steps between two lines of the log."""
@@ -48,7 +48,7 @@ def train(config: Config, started: float | None = None) -> Path:
         KeyboardInterrupt: Ctrl-C, after the step was finished and a checkpoint written.
     """
     out = Path(config.out)
-    saved = load_checkpoint(out / runs.CHECKPOINT) if config.resume else None
+    saved = read_saved(out / runs.CHECKPOINT) if config.resume else None
     if saved is not None and saved["phase"] == "done":
         print(f"{out} is finished ({saved['steps']} steps), there is nothing to resume; its settings can be run anew "
               f"with --config {out / runs.CONFIG}")  # fmt: skip
@@ -142,8 +142,7 @@ def finish(run: Run, octree: Octree) -> None:
         "rows": scores["rows"],
     }  # fmt: skip
     write_json(run.folder / runs.METRICS, metrics)
-    save_checkpoint(run.folder / runs.CHECKPOINT, {"phase": "done", "elapsed": run.clock.elapsed(),
-                                                   "steps": sum(run.steps.values())})  # fmt: skip
+    save_checkpoint(run.checkpoint, {"phase": "done", "steps": sum(run.steps.values())})
     print_table(run, metrics)
 
 
