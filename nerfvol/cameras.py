@@ -30,6 +30,8 @@ Float = NDArray[np.float64]
 TILE = 8
 RIGID_TOLERANCE = 1e-3
 _CACHE_BYTES = 256 << 20
+_LARGEST = 1e100  # intrinsics beyond it overflow in the powers of a lens
+_FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
 
 
 @dataclass(frozen=True)
@@ -61,9 +63,9 @@ class Intrinsics:
             raise InputError(f"the image size must be at least 1x1 pixels, got {self.width}x{self.height}")
         for field in fields(self)[2:-1]:
             value = getattr(self, field.name)
-            if not math.isfinite(value):
+            if not abs(value) < _LARGEST:
                 raise InputError(f"camera intrinsic {field.name} must be a finite number, got {value}")
-        if self.fx <= 0 or self.fy <= 0:
+        if not min(self.fx, self.fy) > 1 / _LARGEST:
             raise InputError(
                 f"the focal lengths must be positive, got fx={self.fx:g}, fy={self.fy:g} (singular intrinsics)"
             )
@@ -201,12 +203,15 @@ def rigid_pose(c2w: ArrayLike) -> Float:
         raise InputError(f"a camera pose must be a 4x4 (or 3x4) matrix, got shape {matrix.shape}")
     if not np.isfinite(matrix).all():
         raise InputError("a camera pose must hold finite numbers only, got NaN or infinity")
+    if not np.abs(matrix[:3, 3]).max() < _FARTHEST:
+        raise InputError(f"a camera must be within {_FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InputError(f"the last row of a camera pose must be 0 0 0 1, got {_numbers(matrix[3])}")
     r = matrix[:3, :3]
-    error = np.abs(r.T @ r - np.eye(3)).max()
-    if error > RIGID_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(r.T @ r - np.eye(3)).max()
         lengths = np.linalg.norm(r, axis=0)
+    if not error <= RIGID_TOLERANCE:
         raise InputError(
             "a camera pose must be rigid (an orthonormal rotation and a translation), got a 3x3 part with columns of "
             f"lengths {_numbers(lengths)} that is orthonormal only to {error:.2g}"

@@ -43,6 +43,11 @@ def undistort(plane: Float, coefficients: Coefficients, fisheye: bool = False) -
 
     Raises InputError where no direction does: beyond the radius where its polynomial turns back a lens has no inverse.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows does not converge, and is refused
+        return _undistort(plane, coefficients, fisheye)
+
+
+def _undistort(plane: Float, coefficients: Coefficients, fisheye: bool) -> Float:
     if fisheye:
         theta_d = np.hypot(plane[:, 0], plane[:, 1])
         theta = _solve_fisheye(theta_d, coefficients)

@@ -91,7 +91,12 @@ def _read_file(path: Path) -> tuple[list[Frame], BoundsHint]:
 
 
 def _load_json(path: Path) -> dict[str, Any]:
-    data = read_json(path)
+    try:
+        data = read_json(path)
+    except InputError:
+        raise
+    except ValueError as error:  # a number of more digits than Python converts
+        raise InputError(f"{path} is not usable JSON: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f'{path}: expected a JSON object with a non-empty list "frames"')
     return data
@@ -126,7 +131,7 @@ def _parse(data: Mapping[str, Any], path: Path) -> tuple[list[Frame], BoundsHint
 def _matrix(value: Any) -> np.ndarray:
     try:
         return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"transform_matrix must be 4 rows of 4 numbers, got {value!r:.60}") from None
 
 
@@ -136,7 +141,7 @@ def _number(data: Mapping[str, Any], *keys: str) -> float | None:
         value = data.get(key)
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
             raise InputError(f"{key} must be a finite number, got {value!r:.40}")
         return float(value)
     return None
@@ -177,7 +182,7 @@ def _hint(data: Mapping[str, Any]) -> BoundsHint:
     if aabb is not None:
         try:
             aabb = np.array(aabb, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise InputError(f"aabb must be two corners of three numbers, got {aabb!r:.60}") from None
         aabb = check_box(aabb, "aabb")
     scale = _number(data, "aabb_scale")

@@ -73,7 +73,7 @@ def read_colmap(folder: Path, split: str) -> Listing:
 
 def _pose(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Camera-to-world (4, 4) in OpenGL axes."""
-    length = np.linalg.norm(quaternion)
+    length = np.linalg.norm(quaternion) if (np.abs(quaternion) < 2).all() else np.inf
     if not np.isfinite(translation).all() or not abs(length - 1) <= 0.1:
         numbers = " ".join(f"{v:g}" for v in (*quaternion, *translation))
         raise InputError(f"a pose must be a unit quaternion and a finite translation, got {numbers}")

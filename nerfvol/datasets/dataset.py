@@ -44,7 +44,7 @@ def check_box(box: ArrayLike, what: str) -> NDArray[np.float64]:
     if corners.size != 6:
         raise InputError(f"{what} must be two corners of three numbers, got shape {corners.shape}")
     corners = corners.reshape(2, 3).copy()
-    if not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
+    if not (np.abs(corners) < 1e15).all() or not (corners[0] < corners[1]).all():
         raise InputError(f"{what} must be finite with its first corner below the second, got {corners.tolist()}")
     return corners
 

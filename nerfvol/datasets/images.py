@@ -162,4 +162,7 @@ def composite(image: UInt8, background: Sequence[float]) -> NDArray[np.float32]:
     if image.shape[2] == 3:
         return values
     behind = np.asarray(background, dtype=np.float32)
-    return behind + values[..., 3:] * (values[..., :3] - behind)
+    mixed = values[..., :3] - behind
+    mixed *= values[..., 3:]
+    mixed += behind
+    return mixed

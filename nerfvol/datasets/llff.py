@@ -7,6 +7,9 @@ original photographs. Source: docs/data.md.
 
 from __future__ import annotations
 
+import struct
+import tokenize
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,11 @@ from nerfvol.datasets.images import SUFFIXES
 from nerfvol.errors import InputError
 
 POSES = "poses_bounds.npy"
+# numpy parses the header as Python literals, so a damaged one can raise whatever that parser does
+_LOAD_ERRORS = (
+    OSError, ValueError, EOFError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError, OverflowError,
+    struct.error, tokenize.TokenError, zipfile.BadZipFile,
+)  # fmt: skip
 
 
 def is_llff_folder(folder: Path) -> bool:
@@ -45,8 +53,8 @@ def read_llff(folder: Path, split: str) -> Listing:
             raise InputError(f"{path}, image {name}: {error}") from None
     chosen, training, sentence = hold_out(frames, split)
     near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
-    if not 0 < near < far:
-        raise InputError(f"{path}: expected depths with 0 < near < far, got {near:g} and {far:g}")
+    if not 0 < near < far < 1e15:
+        raise InputError(f"{path}: expected finite depths with 0 < near < far, got {near:g} and {far:g}")
     return Listing(chosen, training, path, BoundsHint(near_far=(near, far)), [sentence])
 
 
@@ -61,7 +69,7 @@ def image_folder(folder: Path) -> Path:
 def _load_rows(path: Path) -> NDArray[np.float64]:
     try:
         rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except _LOAD_ERRORS as error:
         raise InputError(f"{path}: expected a numpy array of poses, but it cannot be read ({error})") from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise InputError(f"{path}: expected an array of shape (views, 17), got {getattr(rows, 'shape', type(rows))}")
