@@ -6,10 +6,14 @@ import argparse
 import ast
 import sys
 import time
+from pathlib import Path
+
+import numpy as np
 
 from data_synth import integrators, scenes
-from data_synth.dataset import Options, write_dataset
+from data_synth.dataset import Options, render_view, write_dataset
 from data_synth.errors import InputError
+from data_synth.image import write_png
 
 
 def parser() -> argparse.ArgumentParser:
@@ -20,6 +24,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("scene", metavar="SCENE", help="a scene by name, or 'list' for the names of all scenes")
     p.add_argument("--out", metavar="DIR", help="folder to write (made if it is not there)")
+    p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png with a backdrop")
     p.add_argument("--views", type=int, default=60, help="training views; val and test are added (default 60)")
     p.add_argument("--size", default="400x400", metavar="WxH", help="pixels of every view (default 400x400)")
     p.add_argument("--seed", type=int, default=0, help="seed of camera places and of Monte Carlo (default 0)")
@@ -74,7 +79,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _render(args) -> int:
-    if not args.out:
+    if not args.out and not args.picture:
         raise InputError("--out: expected a folder to write, got nothing")
     started = time.perf_counter()
     size = _size(args.size)
@@ -87,6 +92,9 @@ def _render(args) -> int:
         raise InputError(f"--spp: only the path integrator has samples, {scene.name} is rendered by {name}")
     integrator = None if args.scene == "showcase" else integrators.make(name, spp=args.spp)
 
+    if args.picture:
+        return _portrait(scene, integrator, size, args)
+
     def progress(done: int, total: int) -> None:
         if sys.stderr.isatty():
             end = "\n" if done == total else ""
@@ -95,6 +103,20 @@ def _render(args) -> int:
     options = Options(args.views, size, args.seed, integrator, args.exr, progress)
     out = write_dataset(scene, args.out, options)
     print(f"{out}: {args.views} training views of {scene.name} in {time.perf_counter() - started:.1f} s")
+    return 0
+
+
+def _portrait(scene, integrator, size: tuple[int, int], args) -> int:
+    """One view from the middle of the scene's viewing band, over a pale backdrop that darkens downwards."""
+    if Path(args.picture).suffix not in (".jpg", ".png"):
+        raise InputError(f"--picture: expected a name that ends in .jpg or .png, got {args.picture}")
+    started = time.perf_counter()
+    camera = scene.viewpoints.camera(-55.0, 0.5 * sum(scene.viewpoints.elevation) - 5.0, *size)
+    rgba = render_view(scene, camera, integrator, args.seed).rgba8(scene.exposure) / 255.0
+    backdrop = np.linspace(0.93, 0.76, size[1])[:, None, None] * np.array([0.96, 0.985, 1.0])
+    pixels = rgba[..., :3] * rgba[..., 3:] + backdrop * (1.0 - rgba[..., 3:])
+    write_png(args.picture, np.rint(255.0 * pixels).astype(np.uint8))
+    print(f"{args.picture}: {scene.name} in {time.perf_counter() - started:.1f} s")
     return 0
 
 

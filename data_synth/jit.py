@@ -9,6 +9,7 @@ several times faster than numba's own parallel loops and does not care which thr
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,17 +24,17 @@ OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 jit = numba.njit(**OPTIONS)
 
 
-def _sources_stamp() -> tuple[float, int]:
-    """Newest modification time and total size of the package's sources."""
-    stats = [path.stat() for path in Path(__file__).parent.rglob("*.py")]
-    return max(s.st_mtime for s in stats), sum(s.st_size for s in stats)
+def _sources_stamp() -> str:
+    """A digest of the package's compiled sources."""
+    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))]
+    return hashlib.sha256(b"".join(t for t in texts if b"@jit" in t or b"@kernel" in t)).hexdigest()
 
 
 _STAMP = _sources_stamp()
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile an entry point and cache its machine code for as long as no source of the package changes.
+    """Compile an entry point and cache its machine code for as long as no compiled source changes.
 
     Numba itself compares only the file the function stands in, and would go on using code into which it has inlined
     a function of another, since edited file.

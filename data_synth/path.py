@@ -90,9 +90,12 @@ def next_event(w, p, n, material, wo, inside, rng):
 def found_light(w, ray, t, quad, pdf_last):
     """Radiance of the sky or quad light that the sampled direction ran into, with the balance heuristic's weight.
 
-    pdf_last: density of that direction, 0 if next-event estimation could not have found the light.
+    pdf_last: density of that direction; 0 if next-event estimation could not have found the light (camera, mirrors);
+    negative if the density is not known, so that next-event estimation has the light to itself.
     """
     count = w.lights.shape[0]
+    if pdf_last < 0.0:
+        return (0.0, 0.0, 0.0)
     if quad >= 0:
         light, pdf = column3(w.lights, quad, 4), quad_pdf(w.lights, quad, ray, t)
     else:

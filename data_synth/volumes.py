@@ -41,10 +41,10 @@ def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_numpy(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
-        stored = np.load(path, allow_pickle=False)
-        if path.suffix == ".npy":
-            return stored, np.ones(3)
-        with stored:
+        with open(path, "rb") as file:
+            stored = np.load(file, allow_pickle=False)
+            if path.suffix == ".npy":
+                return stored, np.ones(3)
             names = [n for n in ("density", *stored.files) if n in stored.files and stored[n].ndim == 3]
             if not names:
                 raise InputError(f"{path}: expected a 3D array, got {', '.join(stored.files) or 'nothing'}")

@@ -89,19 +89,17 @@ def _gem(material: int, centre, radius: float) -> np.ndarray:
     return surfaces.mesh(material, v + np.asarray(centre), f)
 
 
-def fog(density: float = 0.35, g: float = 0.55) -> Scene:
-    """fog with shafts of light that fall through a slotted roof onto a checker floor"""
+def fog(density: float = 0.30, g: float = 0.35) -> Scene:
+    """fog with shafts of light that fall through a slotted wall onto a checker floor"""
     medium = media.homogeneous((-2, -2, -1), (2, 2, 1.5), density, 0.97, phase=phase.henyey_greenstein(g))
-    slots = [surfaces.box(1, (-2, -2 + 0.62 * k, 1.2), (2, -1.62 + 0.62 * k, 1.27)) for k in range(7)]
-    bars = [surfaces.box(1, (-2 + 1.05 * k, -2, 1.2), (-1.4 + 1.05 * k, 2, 1.27)) for k in range(4)]
+    wall = [surfaces.box(1, (1.75, y, -1.0), (1.85, y + 0.62, 1.5)) for y in (-2.0, -1.127, -0.253, 0.62, 1.38)]
     return Scene(
         medium=medium._replace(step=0.04),
         shapes=[
             surfaces.box(0, (-2, -2, -1.1), (2, 2, -1.0)),
             surfaces.sphere(2, (-0.5, -0.3, -0.55), 0.45),
             surfaces.box(3, (0.5, 0.1, -1.0), (1.1, 0.7, -0.2)),
-            *slots,
-            *bars,
+            *wall,
         ],
         materials=[
             materials.lambert((0.7, 0.68, 0.62), (0.12, 0.13, 0.16), 0.4),
@@ -109,8 +107,8 @@ def fog(density: float = 0.35, g: float = 0.55) -> Scene:
             materials.blinn_phong((0.6, 0.06, 0.05), 0.2, 60),
             materials.lambert((0.1, 0.3, 0.5)),
         ],
-        lights=[lights.directional((0.45, -0.35, 1.0), (9.0, 7.6, 5.6)), lights.environment((0.04, 0.05, 0.07))],
-        viewpoints=Viewpoints(target=(0, 0, -0.2), radius=5.6, elevation=(4, 22), fov=42),
+        lights=[lights.directional((1.0, -0.12, 0.55), (26.0, 21.0, 14.5)), lights.environment((0.10, 0.13, 0.20))],
+        viewpoints=Viewpoints(target=(0, 0, -0.2), radius=5.8, elevation=(8, 40), fov=42),
         integrators=("march", "path", "deep"),
         aabb=np.array([[-2.05, -2.05, -1.15], [2.05, 2.05, 1.5]]),
     )
@@ -152,15 +150,15 @@ def leaf(thickness: float = 1.4) -> Scene:
         for j in range(m + 1):
             t = 2.0 * j / m - 1.0
             x = -1.2 + 2.4 * s
-            z = 0.25 * np.sin(1.9 * s) - 0.35 * s * s + 0.20 * abs(t) * half - 0.02 * np.cos(40 * s)
+            z = 0.25 * np.sin(1.9 * s) - 0.35 * s * s + 0.20 * abs(t) * half - 0.008 * np.cos(50 * s)
             rows.append((x, half * t, z))
     for i in range(n):
         for j in range(m):
             a = i * (m + 1) + j
             faces += [[a, a + m + 1, a + 1], [a + 1, a + m + 1, a + m + 2]]
-    skin = spongecake.layer(0.35, flakes.surface((0, 0, 1), 0.2), (0.9, 0.95, 0.85))
-    flesh = spongecake.layer(thickness, flakes.surface((0, 0, 1), 0.75), (0.38, 0.80, 0.12))
-    vein = spongecake.layer(0.3, flakes.fibre((1, 0, 0), 0.3), (0.75, 0.9, 0.4))
+    skin = spongecake.layer(0.10, flakes.surface((0, 0, 1), 0.25), (0.9, 0.95, 0.85))
+    flesh = spongecake.layer(thickness, flakes.surface((0, 0, 1), 0.75), (0.30, 0.78, 0.08))
+    vein = spongecake.layer(0.3, flakes.fibre((1, 0, 0), 0.3), (0.45, 0.85, 0.15))
     return Scene(
         triangles=surfaces.mesh(0, np.array(rows), np.array(faces)),
         materials=[materials.layered(0, 3)],

@@ -33,7 +33,7 @@ def cloud(
         viewpoints=Viewpoints(radius=4.6, elevation=(-5, 60), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([lo, hi]),
-        exposure=0.9,
+        exposure=0.62,
     )
 
 
@@ -50,11 +50,11 @@ def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int 
         viewpoints=Viewpoints(radius=4.8, elevation=(-10, 50), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([[-1.2] * 3, [1.2] * 3]),
-        exposure=0.9,
+        exposure=0.62,
     )
 
 
-def stratus(coverage: float = 0.72, density: float = 16.0, resolution: int = 160, seed: int = 1) -> Scene:
+def stratus(coverage: float = 0.60, density: float = 18.0, resolution: int = 160, seed: int = 1) -> Scene:
     """a broken layer of stratus, seen from above and below"""
     lo, hi = (-1.6, -1.6, -0.3), (1.6, 1.6, 0.3)
     rho = clouds.cloud("stratus", (resolution, resolution, resolution // 4), coverage, 1.6, 0.35, seed)
@@ -68,11 +68,11 @@ def stratus(coverage: float = 0.72, density: float = 16.0, resolution: int = 160
         viewpoints=Viewpoints(radius=4.6, elevation=(10, 65), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([lo, hi]),
-        exposure=0.9,
+        exposure=0.62,
     )
 
 
-def smoke(density: float = 11.0, resolution: int = 128, seed: int = 2, volume: str | None = None) -> Scene:
+def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: str | None = None) -> Scene:
     """a smoke plume over a floor that shows its shadow; takes any volume: --volume smoke.vdb"""
     lo, hi = (-0.8, -0.8, -1.1), (0.8, 0.8, 1.3)
     if volume is None:
@@ -82,16 +82,16 @@ def smoke(density: float = 11.0, resolution: int = 128, seed: int = 2, volume: s
         in_bands(lambda a, b: _plume(detail, rho, a, b), rho.shape[0], 4)
     else:
         rho, lo, hi = _imported(volume, None, lo, hi, up="y")
-    medium = media.grid(rho, lo, hi, density, (0.80, 0.78, 0.76), phase=phase.henyey_greenstein(0.3))
+    medium = media.grid(rho, lo, hi, density, (0.92, 0.90, 0.88), phase=phase.henyey_greenstein(0.3))
     return Scene(
         medium=medium,
         shapes=[surfaces.box(0, (-1.5, -1.5, -1.25), (1.5, 1.5, -1.15))],
-        materials=[materials.lambert((0.42, 0.40, 0.37), (0.20, 0.21, 0.24), 0.3)],
-        lights=[lights.directional((0.9, -0.5, 0.9), (11.0, 10.0, 8.6)), lights.sky((0.5, 0.65, 1.0), 0.8, 0.3)],
+        materials=[materials.lambert((0.36, 0.34, 0.31), (0.15, 0.16, 0.18), 0.3)],
+        lights=[lights.directional((0.9, -0.5, 0.9), (17.0, 15.5, 13.2)), lights.sky((0.5, 0.65, 1.0), 0.8, 0.3)],
         viewpoints=Viewpoints(radius=5.0, elevation=(5, 55), fov=40),
         integrators=("deep", "march", "path"),
         aabb=np.array([[-1.5, -1.5, -1.25], [1.5, 1.5, 1.35]]),
-        exposure=0.9,
+        exposure=0.62,
     )
 
 
@@ -116,14 +116,14 @@ def _plume(t, out, first, last):
                 out[i, j, k] = min(max(2.2 * edge, 0.0), 1.0) * fade * (1.0 - 0.65 * z)
 
 
-def explosion(density: float = 16.0, heat: float = 9.0, resolution: int = 128, seed: int = 4) -> Scene:
+def explosion(density: float = 16.0, heat: float = 16.0, resolution: int = 128, seed: int = 4) -> Scene:
     """a fireball: soot that glows as a black body where it is hot"""
     n = resolution
     rho, hot = np.empty((n, n, n), np.float32), np.empty((n, n, n), np.float32)
     t = cloud_textures(seed, 64).base
     in_bands(lambda a, b: _fireball(t, rho, hot, a, b), n, 4)
     kelvin = np.linspace(0.0, 1.0, 32)
-    glow = np.stack([kelvin**2.2, 0.42 * kelvin**4.0, 0.12 * kelvin**7.5], axis=1) * heat
+    glow = np.stack([kelvin**2.2, 0.48 * kelvin**3.6, 0.16 * kelvin**6.5], axis=1) * heat
     medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.35, glow, attribute=hot)
     return Scene(
         medium=medium,

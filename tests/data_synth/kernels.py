@@ -1,6 +1,7 @@
 """Compiled loops that let the tests look into the scalar functions, a few for all tests so that little is compiled."""
 
 import numpy as np
+
 from data_synth import phase, sggx, spongecake
 from data_synth.jit import kernel
 from data_synth.rng import new_rng
@@ -90,7 +91,7 @@ def cake_samples(layers, wo, n, seed=0):
 
 
 class SphereGrid:
-    """Bins of the sphere in (cos theta, azimuth) with Gauss-Legendre points in each: exact enough for smooth densities."""
+    """Bins of the sphere in (cos theta, azimuth), with Gauss-Legendre points in each."""
 
     def __init__(self, n_cos=16, n_azimuth=16, order=6):
         x, w = np.polynomial.legendre.leggauss(order)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from data_synth import phase, sggx
 from data_synth.errors import InputError
 from tests.data_synth.kernels import SphereGrid, flake_values, phase_samples, phase_values, unit

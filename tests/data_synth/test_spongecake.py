@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from data_synth import sggx, spongecake
 from data_synth.errors import InputError
 from tests.data_synth.kernels import SphereGrid, cake_samples, cake_values, unit

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from tests.helpers.statistics import assert_histogram, assert_means, assert_sample_mean, sidak
 
 

@@ -1,0 +1,221 @@
+"""Cameras, pictures, the folder that is written, and the command line."""
+
+import ast
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_synth import (
+    Camera,
+    InputError,
+    Options,
+    Viewpoints,
+    look_at,
+    media,
+    render,
+    scenes,
+    transmittance,
+    write_dataset,
+)
+from data_synth.cli import main
+from data_synth.image import Picture, linear_to_srgb, read_exr, srgb_to_linear, write_exr
+from data_synth.scenes.showcase import Showcase, edge_pixels
+
+
+@pytest.fixture(scope="module")
+def showcase():
+    return Showcase(smooth=1)
+
+
+def test_look_at_is_opengl():
+    c2w = look_at((4.0, 0.0, 0.0))
+    assert np.allclose(c2w[:3, 2], [1, 0, 0]) and np.allclose(c2w[:3, 1], [0, 0, 1])  # looks down -z, y is up
+    assert np.allclose(np.linalg.det(c2w[:3, :3]), 1)
+
+
+def test_viewpoints_stay_in_their_band_and_do_not_repeat():
+    band = Viewpoints(target=(0, 0, 0.5), radius=3.0, elevation=(10, 60))
+    eyes = np.array([c.c2w[:3, 3] for c in band.spread(40, 8, 8, seed=1)]) - [0, 0, 0.5]
+    elevation = np.degrees(np.arcsin(eyes[:, 2] / 3.0))
+    assert np.allclose(np.linalg.norm(eyes, axis=1), 3.0) and elevation.min() >= 10 and elevation.max() <= 60
+    gaps = np.linalg.norm(eyes[:, None] - eyes[None], axis=-1) + 9 * np.eye(40)
+    assert gaps.min() > 0.25
+
+
+def test_rays_go_through_pixel_centres():
+    """A glowing ball 0.1 px wide lies behind the centre of pixel (5, 2): that pixel sees it, at the right distance."""
+    c = Camera(9, 7, 12.0, look_at((0.5, -3.0, 1.0), (0.1, 0.2, 0.0)))
+    d = np.array([(5 + 0.5 - 4.5) / 12.0, -(2 + 0.5 - 3.5) / 12.0, -1.0])
+    centre = c.c2w[:3, 3] + 2.5 * (c.c2w[:3, :3] @ d) / np.linalg.norm(d)
+    from data_synth import Emission, Scene, materials, surfaces
+
+    r = 0.05 * 2.5 / 12.0
+    scene = Scene(
+        medium=media.homogeneous(centre - r, centre + r, 1e6, Le=1.0),
+        shapes=[surfaces.sphere(0, centre, r)], materials=[materials.null()], bounded=True,
+    )  # fmt: skip
+    picture = Emission().render(scene, c)
+    assert np.argwhere(picture.alpha > 0).tolist() == [[2, 5]]
+    assert picture.distance[2, 5] == pytest.approx(2.5, abs=2 * r)
+
+
+def test_showcase_haze_converges_to_itself(showcase):
+    """Midpoint quadrature: the error against 16 times the steps falls at second order."""
+    camera = showcase.viewpoints.camera(20, 25, 24, 24)
+    pictures = {n: Showcase(steps=n, smooth=1).render(camera) for n in (48, 96, 768)}
+    errors = [np.abs(pictures[n].rgb - pictures[768].rgb).mean() for n in (48, 96)]
+    assert errors[0] / errors[1] > 3.0
+    assert np.abs(pictures[96].rgb - pictures[768].rgb).max() < 0.01
+
+
+def test_showcase_is_opaque_where_solid_and_clear_outside(showcase):
+    picture = showcase.render(showcase.viewpoints.camera(20, 25, 64, 64))
+    assert picture.alpha.min() == 0.0 and picture.alpha.max() == 1.0
+    hazy = (picture.alpha > 0.02) & (picture.alpha < 0.98)
+    assert 0.02 < hazy.mean() < 0.4
+    assert np.allclose(picture.rgb[picture.alpha == 0], 0.0)
+
+
+def test_gloss_depends_on_the_view(showcase):
+    """The same surface point seen from two sides has two colours, a matt one would not."""
+    from data_synth.jit import kernel
+    from data_synth.scenes.showcase import surface_radiance
+
+    @kernel
+    def look(out):
+        for k in range(2):
+            x = 0.6 if k == 0 else -0.6
+            out[k, 0], out[k, 1], out[k, 2] = surface_radiance(0, -0.62, -0.38, 0.09, x, 0.0, -0.8)
+
+    out = np.empty((2, 3))
+    look(out)
+    assert np.abs(out[0] - out[1]).max() > 0.05
+
+
+def test_edges_are_found():
+    image = np.zeros((5, 6, 4))
+    image[2:, 3:] = 1.0
+    found = {tuple(p) for p in edge_pixels(image, 0.5)}
+    assert (2, 3) in found and (1, 4) in found and (4, 2) in found and (0, 0) not in found and (4, 5) not in found
+
+
+def test_pictures_are_straight_srgb():
+    rgb = np.array([[[0.1, 0.2, 0.05], [0.0, 0.0, 0.0]]])
+    pixels = Picture(rgb, np.array([[0.5, 0.0]]), np.zeros((1, 2))).rgba8()
+    assert pixels[0, 0].tolist() == [*np.rint(255 * linear_to_srgb(rgb[0, 0] / 0.5)), 128]
+    assert pixels[0, 1].tolist() == [0, 0, 0, 0]
+    x = np.linspace(0, 1, 100)
+    assert np.allclose(srgb_to_linear(linear_to_srgb(x)), x, atol=1e-12)
+
+
+def test_exr_round_trip(tmp_path):
+    channels = {n: np.random.default_rng(k).random((5, 7)).astype(np.float32) for k, n in enumerate("RGBAZ")}
+    write_exr(tmp_path / "a.exr", channels)
+    back = read_exr(tmp_path / "a.exr")
+    assert all(np.array_equal(channels[n], back[n]) for n in channels)
+
+
+def test_dataset_has_the_nerf_synthetic_layout(tmp_path):
+    scene = scenes.make("sphere")
+    write_dataset(scene, tmp_path / "out", Options(views=3, size=(12, 10), seed=4, exr=True))
+    for split, n in (("train", 3), ("val", 1), ("test", 2)):
+        meta = json.loads((tmp_path / "out" / f"transforms_{split}.json").read_text())
+        assert len(meta["frames"]) == n
+        for frame in meta["frames"]:
+            path = tmp_path / "out" / (frame["file_path"] + ".png")
+            pixels = np.asarray(Image.open(path))
+            assert pixels.shape == (10, 12, 4) and pixels.dtype == np.uint8
+            assert "Z" in read_exr(path.with_suffix(".exr"))
+            pose = np.array(frame["transform_matrix"])
+            assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
+    assert meta["camera_angle_x"] == pytest.approx(np.radians(scene.viewpoints.fov))
+    provenance = json.loads((tmp_path / "out" / "provenance.json").read_text())
+    assert provenance["scene"] == "sphere" and provenance["seed"] == 4
+    # the same seed makes the same bytes
+    write_dataset(scene, tmp_path / "again", Options(views=3, size=(12, 10), seed=4))
+    for png in sorted((tmp_path / "out").rglob("*.png")):
+        assert png.read_bytes() == (tmp_path / "again" / png.relative_to(tmp_path / "out")).read_bytes()
+
+
+def test_a_pixel_of_a_written_view_is_the_chord(tmp_path):
+    """From the files alone: pose, angle and alpha of the homogeneous sphere satisfy alpha = 1 - exp(-sigma chord)."""
+    write_dataset(scenes.make("sphere"), tmp_path, Options(views=1, size=(33, 33)))
+    meta = json.loads((tmp_path / "transforms_train.json").read_text())
+    pose = np.array(meta["frames"][0]["transform_matrix"])
+    alpha = np.asarray(Image.open(tmp_path / "train" / "r_0.png"))[..., 3] / 255.0
+    focal = 16.5 / np.tan(0.5 * meta["camera_angle_x"])
+    for j, i in ((16, 16), (10, 12), (20, 25)):
+        d = pose[:3, :3] @ np.array([(i - 16.0) / focal, -(j - 16.0) / focal, -1.0])
+        d /= np.linalg.norm(d)
+        b = np.dot(pose[:3, 3], d)
+        h = 1.0 - (pose[:3, 3] @ pose[:3, 3] - b * b)
+        want = np.mean(1 - np.exp(-1.6 * np.array([0.5, 0.8, 1.0]) * 2 * np.sqrt(max(h, 0.0))))
+        assert alpha[j, i] == pytest.approx(want, abs=0.51 / 255)
+
+
+def test_imported_volume_fills_the_scene(tmp_path):
+    rho = np.zeros((9, 9, 9), np.float32)
+    rho[4, 4, 4] = 7.0
+    np.savez(tmp_path / "v.npz", density=rho)
+    scene = scenes.make("smoke", volume=str(tmp_path / "v.npz"), density=3.0)
+    centre = 0.5 * (np.array(scene.medium.lo) + scene.medium.hi)
+    T = transmittance.sample_transmittance(scene.medium, centre - [0, 0, 1e-4], (0.0, 0.0, 1.0), 2e-4, "regular")
+    assert -np.log(T[0, 0]) / 2e-4 == pytest.approx(3.0, rel=1e-2)
+
+
+def test_command_line(tmp_path, capsys):
+    assert main(["list"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in scenes.SCENES)
+    argv = ["slab", "--views", "1", "--size", "6x4", "--set", "sigma=2.0", "--out", str(tmp_path / "o")]
+    assert main(argv) == 0
+    assert json.loads((tmp_path / "o" / "provenance.json").read_text())["parameters"] == {"sigma": 2.0}
+    assert main(["slab", "--picture", str(tmp_path / "p.jpg"), "--size", "8x8"]) == 0
+
+
+@pytest.mark.parametrize(
+    "argv, message",
+    [
+        (["clod", "--out", "x"], "did you mean cloud?"),
+        (["slab", "--out", "x", "--set", "sigm=1"], "did you mean sigma?"),
+        (["slab", "--out", "x", "--set", "sigma"], "KEY=VALUE"),
+        (["slab", "--out", "x", "--set", "sigma=-1"], "sigma_t"),
+        (["slab", "--out", "x", "--set", "sigma=abc"], "wrong type"),
+        (["slab", "--out", "x", "--size", "40"], "WxH"),
+        (["slab", "--out", "x", "--views", "0"], "--views"),
+        (["slab", "--out", "x", "--integrator", "deep"], "emission, path"),
+        (["slab", "--out", "x", "--light", "sin"], "did you mean sun?"),
+        (["slab"], "--out"),
+        (["smoke", "--out", "x", "--volume", "missing.vdb"], "missing.vdb"),
+    ],
+)
+def test_bad_command_lines_are_one_sentence_and_code_2(argv, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and "Traceback" not in error
+    assert not (tmp_path / "x" / "transforms_train.json").exists()
+
+
+def test_render_is_public():
+    picture = render(scenes.sphere(), scenes.sphere().viewpoints.camera(0, 10, 6, 6))
+    assert picture.rgb.shape == (6, 6, 3)
+
+
+def test_data_synth_imports_nothing_from_nerfvol():
+    folder = Path(__file__).parents[2] / "data_synth"
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any(n.split(".")[0] == "nerfvol" for n in names), path
+
+
+def test_bad_cameras_are_refused():
+    with pytest.raises(InputError, match="rotation"):
+        Camera(4, 4, 5.0, np.diag([1.0, 2.0, 1.0, 1.0]))
+    with pytest.raises(InputError, match="focal"):
+        Camera(4, 4, 0.0, np.eye(4))

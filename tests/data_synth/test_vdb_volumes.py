@@ -1,0 +1,106 @@
+"""OpenVDB, npz and raw volumes: round trips, a real file, hostile files."""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_synth import media
+from data_synth.errors import InputError
+from data_synth.vdb import read_vdb, write_vdb
+from data_synth.volumes import read_volume, write_density
+
+
+@pytest.fixture
+def values():
+    v = np.random.default_rng(0).random((20, 140, 33)).astype(np.float32)
+    v[v < 0.5] = 0.0
+    v[:, 40:100] = 0.0
+    return v
+
+
+def test_round_trip(tmp_path, values):
+    write_vdb(tmp_path / "a.vdb", values, (0.5, 0.25, 2.0), (1.0, 2.0, 3.0))
+    grid = read_vdb(tmp_path / "a.vdb")
+    assert grid.name == "density" and np.allclose(grid.voxel_size, (0.5, 0.25, 2.0))
+    assert np.allclose(grid.origin, (1.0, 2.0, 3.0))
+    part = values[tuple(slice(f, f + n) for f, n in zip(grid.first, grid.values.shape, strict=True))]
+    assert np.array_equal(part, grid.values) and grid.values.sum() == values.sum()
+
+
+def test_every_truncation_is_an_input_error(tmp_path, values):
+    write_vdb(tmp_path / "a.vdb", values[:9, :9, :9])
+    data = (tmp_path / "a.vdb").read_bytes()
+    for n in [0, 7, 15, 60, 100, len(data) // 2, len(data) - 1]:
+        (tmp_path / "b.vdb").write_bytes(data[:n])
+        with pytest.raises(InputError, match="b.vdb"):
+            read_vdb(tmp_path / "b.vdb")
+
+
+def test_random_damage_never_escapes(tmp_path, values):
+    write_vdb(tmp_path / "a.vdb", values[:9, :9, :9])
+    data, rng = bytearray((tmp_path / "a.vdb").read_bytes()), np.random.default_rng(1)
+    for _ in range(60):
+        damaged = bytearray(data)
+        damaged[int(rng.integers(0, 600))] = int(rng.integers(0, 256))
+        (tmp_path / "b.vdb").write_bytes(damaged)
+        try:
+            read_vdb(tmp_path / "b.vdb")
+        except InputError:
+            pass
+
+
+def test_blosc_and_other_formats_are_named(tmp_path, values):
+    write_vdb(tmp_path / "a.vdb", values[:9, :9, :9])
+    data = (tmp_path / "a.vdb").read_bytes()
+    at = data.index(struct.pack("<I", 2) + struct.pack("<I", 5) + b"class") - 4
+    (tmp_path / "b.vdb").write_bytes(data[:at] + struct.pack("<I", 4) + data[at + 4 :])
+    with pytest.raises(InputError, match="blosc"):
+        read_vdb(tmp_path / "b.vdb")
+    (tmp_path / "c.vdb").write_bytes(b"not a volume at all, only text")
+    with pytest.raises(InputError, match="another format"):
+        read_vdb(tmp_path / "c.vdb")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_vdb(tmp_path / "missing.vdb")
+
+
+def test_numpy_and_raw(tmp_path):
+    v = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
+    np.savez(tmp_path / "v.npz", density=v, voxel_size=[1.0, 2.0, 3.0])
+    values, spacing = read_volume(tmp_path / "v.npz")
+    assert np.array_equal(values, v) and np.array_equal(spacing, [1, 2, 3])
+    v.transpose(2, 1, 0).tofile(tmp_path / "head_2x3x4_uint8.raw")
+    assert np.array_equal(read_volume(tmp_path / "head_2x3x4_uint8.raw")[0], v)
+    np.savez(tmp_path / "flat.npz", a=np.zeros(3))
+    for name, message in (("flat.npz", "3D array"), ("no.vdb", "no such file")):
+        with pytest.raises(InputError, match=message):
+            read_volume(tmp_path / name)
+    (tmp_path / "bad.npz").write_bytes(b"PK\3\4 rubbish")
+    with pytest.raises(InputError, match="numpy volume"):
+        read_volume(tmp_path / "bad.npz")
+
+
+def test_pickles_are_not_loaded(tmp_path):
+    np.save(tmp_path / "evil.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(InputError, match="evil.npy"):
+        read_volume(tmp_path / "evil.npy")
+
+
+def test_written_truth_is_the_extinction(tmp_path, values):
+    m = media.grid(values, (0, 0, 0), (1, 7, 1.6), sigma_t=(1.0, 2.0, 3.0))
+    write_density(m, tmp_path)
+    with np.load(tmp_path / "density.npz") as stored:
+        assert np.array_equal(stored["density"], 2.0 * values) and np.allclose(stored["hi"], (1, 7, 1.6))
+    assert read_vdb(tmp_path / "density.vdb").values.sum() == pytest.approx(2.0 * values.sum(dtype=float), rel=1e-5)
+
+
+def test_a_real_file_reads_exactly():
+    if "NERFVOL_DATA" not in os.environ:
+        pytest.skip("NERFVOL_DATA is not set")
+    folder = Path(os.environ["NERFVOL_DATA"]) / "volumes"
+    grid = read_vdb(folder / "smoke.vdb")
+    with np.load(folder / "smoke_dense_f32.npz") as dense:
+        assert np.array_equal(grid.values, dense["density"]) and np.array_equal(grid.first, dense["ijk_min"])
+        assert np.allclose(grid.voxel_size, dense["voxel_size"])
