@@ -22,8 +22,9 @@ VERTEX_BYTES = 4 + 24
 """Per vertex: a slot (int32) and its lattice position (3 int64), beside two rows of floats."""
 VERTICES_PER_LEAF = 1.25
 """Vertices of a thin shell of leaves, measured on trained octrees: 1.12 to 1.3."""
-CHANGE_BYTES_PER_LEAF = 620
-"""Per new leaf while the octree is rebuilt (prune, subdivide): lattice keys, their numbering, the old octree."""
+CHANGE_BYTES_PER_LEAF = 250
+"""Per leaf while the octree is rebuilt: what describes the change, and the old octree (an eighth of a split one's size)
+or the new one (half of a pruned one's). Measured with tracemalloc, see the tests."""
 TILE_BYTES_PER_PIXEL = 6
 """Per training pixel: the image composited to 8-bit RGB, and the same in 8x8 tiles (the former is then let go)."""
 SHARE = 0.9

@@ -1,5 +1,7 @@
 """The estimate of training memory: sums of real array sizes, and a refusal that says what to try."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from conftest import make_sphere_octree
@@ -25,6 +27,30 @@ def test_octree_bytes_are_those_of_its_arrays(degree):
     real = sum(array.nbytes for array in held)
     # the vertices a leaf has differ from shape to shape: the stated range is 1.12 to 1.3 against 1.25
     assert real == pytest.approx(octree_bytes(octree.n_leaves, degree), rel=0.12)
+
+
+def test_changing_an_octree_takes_what_is_reckoned_with():
+    """Splitting every leaf and pruning every second one, with the second moments that follow."""
+    octree = make_sphere_octree(6).with_sh_degree(1)
+    moments = ops.TrainState(octree).moments
+    before = octree_bytes(octree.n_leaves, 1)
+    tracemalloc.start()
+    try:
+        split, transfer = octree.subdivide(np.ones(octree.n_leaves, bool))
+        moments = transfer.vertices(moments)
+        state = ops.TrainState(split, moments)
+        peak = before + tracemalloc.get_traced_memory()[1]
+        planned = octree_bytes(split.n_leaves, 1) + memory.CHANGE_BYTES_PER_LEAF * split.n_leaves
+        assert 0.6 * planned < peak < 1.1 * planned
+        del transfer
+        tracemalloc.reset_peak()
+        pruned, transfer = split.prune(np.arange(split.n_leaves) % 2 == 0)
+        transfer.vertices(moments)
+        peak = tracemalloc.get_traced_memory()[1]
+        assert 0.6 * planned < peak < 1.1 * planned
+    finally:
+        tracemalloc.stop()
+    del state
 
 
 def test_refusal_names_the_parts_and_a_way_out(dataset):
