@@ -53,8 +53,8 @@ class DistillConfig:
     """Leaves whose largest rendering weight over the training rays is below are removed; 0 keeps all."""
     samples_per_vertex: int = 8
     """Field samples averaged into a vertex: 1 (the vertex itself) or 8."""
-    max_leaves: int = 8_000_000
-    """Refinement stops before there are more candidates than this."""
+    max_leaves: int = 4_000_000
+    """Most candidates; ``empty_opacity`` is raised until they fit."""
     visibility_downscale: int = 4
     compare_downscale: int = 4
     compare_views: int = 4
@@ -195,17 +195,20 @@ def candidate_cells(
         per_axis = 4 if level == start else 2
         sigmas = largest_sigma(field, frame.origin + cells * edge, edge, per_axis)
         # Thickness of the leaf this cell would be cut into.
-        holds = sigmas * (frame.size / 2.0 ** np.maximum(wanted, level)) > threshold
-        kept = dilated(cells, holds, 1 << level)
+        thickness = sigmas * (frame.size / 2.0 ** np.maximum(wanted, level))
+        room = config.max_leaves - sum(len(part) for _, part in done)
+        kept = dilated(cells, thickness > threshold, 1 << level)
+        while np.where(wanted[kept] <= level, 1, 8).sum() > room and (thickness[kept] > threshold).any():
+            threshold *= 2
+            kept = dilated(cells, thickness > threshold, 1 << level)
         finished = wanted[kept] <= level
         done.append((level, cells[kept][finished]))
-        cells = cells[kept][~finished]
-        total = sum(len(part) for _, part in done)
-        if level < frame.finest and total + 8 * len(cells) > config.max_leaves:
-            messages.append(f"refinement stopped at level {level}: more than {config.max_leaves} cells hold something")
-            done.append((level, cells))
-            break
-        cells = (2 * cells[:, None] + OFFSETS).reshape(-1, 3)
+        cells = (2 * cells[kept][~finished][:, None] + OFFSETS).reshape(-1, 3)
+    if threshold > -math.log1p(-config.empty_opacity):
+        messages.append(
+            f"the field is hazy: only what is more opaque than {-math.expm1(-threshold):.2g} a leaf fits into "
+            f"{config.max_leaves} leaves"
+        )
     levels = np.concatenate([np.full(len(part), level) for level, part in done])
     if not len(levels):
         raise InputError(

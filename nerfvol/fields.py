@@ -70,7 +70,7 @@ class FieldShape:
     head: Literal["sh", "rgb"] = "sh"
     sh_degree: int = 1
     density: Literal["exp", "softplus"] = "exp"
-    density_bias: float = 0.0
+    density_bias: float = -1.0
 
     def __post_init__(self) -> None:
         if min(self.width, self.depth) < 1 or not 0 <= self.skip < self.depth:

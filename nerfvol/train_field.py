@@ -40,9 +40,9 @@ class FieldConfig:
     """Images are area-averaged by these factors, coarse ones first."""
     stage_ends: tuple[float, ...] = (0.08, 0.35, 1.0)
     """Progress in (0, 1] at which each of them ends."""
-    samples_per_step: int = 32768
+    samples_per_step: int = 16384
     """Samples of one step: the number of rays follows from how many samples a ray has just now."""
-    max_rays: int = 16384
+    max_rays: int = 8192
     """Most rays of one step."""
     march_steps: tuple[int, ...] = (96, 192, 384)
     """Marching steps along the diagonal of the detail cube, for each of them."""

@@ -168,6 +168,21 @@ def test_candidates_cover_what_is_dense_and_little_else() -> None:
     assert not found[distance > radius + (1 + math.sqrt(3)) * 2 / 32 + math.sqrt(3) / 16].any()
 
 
+def test_a_hazy_field_keeps_its_densest_cells() -> None:
+    """Too many candidates: the threshold rises until they fit, which is said; the middle of the blob stays."""
+    frame, messages = Frame.of(DOMAIN, 5), []
+    config = DistillConfig(level=5, coarse_level=3, max_leaves=3000)
+    level, ijk = candidate_cells(Blob(), frame, config, messages)
+    assert 300 < len(ijk) <= 3000 and (level == 5).all()
+    assert len(messages) == 1 and "hazy" in messages[0]
+    everywhere = np.array(list(np.ndindex(32, 32, 32)))
+    found, wanted = (int((np.linalg.norm(cells + 0.5 - 16, axis=1) < 3).sum()) for cells in (ijk, everywhere))
+    assert found == wanted
+    unlimited: list[str] = []
+    assert len(candidate_cells(Blob(), frame, DistillConfig(level=5, coarse_level=3), unlimited)[0]) > 3000
+    assert not unlimited
+
+
 def test_dilation_is_one_cell() -> None:
     cells = np.array(list(np.ndindex(5, 5, 5)))
     holds = (cells == (2, 2, 2)).all(1) | (cells == (0, 0, 4)).all(1)

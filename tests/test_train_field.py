@@ -50,7 +50,11 @@ def test_learns_the_ball(dataset: Dataset, sampler: str) -> None:
     """Better than any constant image by 6 dB after a second or two, and with far fewer samples than a full march."""
     config = dataclasses.replace(TINY, steps=160, sampler=sampler, n_coarse=24, n_fine=24, bfloat16=False)
     trainer = FieldTrainer(dataset, config, seed=1)
-    metrics = [trainer.step() for _ in range(config.steps)]
+    untouched = trainer.grid.sigmas.clone()
+    metrics = [trainer.step()]
+    # What the samples of the very first step saw is noted; the importance sampler needs no grid.
+    assert bool((trainer.grid.sigmas != untouched).any()) == (sampler == "occupancy")
+    metrics += [trainer.step() for _ in range(config.steps - 1)]
     assert metrics[0]["downscale"] == 4 and metrics[-1]["downscale"] == 2
     truth = np.concatenate([dataset.composited(i, (1, 1, 1)).reshape(-1, 3) for i in range(4)])
     constant = -10 * math.log10(((truth - truth.mean(0)) ** 2).mean())
