@@ -39,8 +39,6 @@ LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
 RUNNING = 0.98
 """Memory, per step, of the running error."""
-PREVIEW_WIDTH = 200
-"""Most pixels across of a preview."""
 
 
 _STATE = {
@@ -54,6 +52,7 @@ class Phase(Protocol):
 
     name: str
     steps: int
+    preview_width: int
     trainer: Any
 
     @property
@@ -197,7 +196,7 @@ class Run:
     def preview(self, phase: Phase, moment: float) -> None:
         """The first held-out view, small: truth beside what the phase has."""
         camera, image = self.held_out.cameras[0], self.held_out.images[0]
-        k = max(1, -(-camera.intrinsics.width // PREVIEW_WIDTH))
+        k = max(1, -(-camera.intrinsics.width // phase.preview_width))
         truth = composite_average(image, self.config.background, k).astype(np.float32) / 255
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
         pictures.write_png(self.preview_folder / f"{phase.name}_{round(100 * moment):03d}.png", picture)

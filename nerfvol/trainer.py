@@ -152,6 +152,7 @@ class FieldPhase:
 
     name = "field"
     previews = (0.1, 0.4, 1.0)
+    preview_width = 100  # a field renders slowly
     stages_left = 0
 
     def __init__(self, run: Run) -> None:
@@ -191,6 +192,7 @@ class OctreePhase:
 
     name = "octree"
     previews = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+    preview_width = 200
 
     def __init__(self, run: Run, octree: Octree | None) -> None:
         config = run.config
