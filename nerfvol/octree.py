@@ -178,7 +178,7 @@ class Octree:
 
     @property
     def n_vertices(self) -> int:
-        return len(self.values)
+        return len(self._vertex_ijk)
 
     @property
     def max_level(self) -> int:

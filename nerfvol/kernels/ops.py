@@ -16,7 +16,7 @@ from torch import Tensor
 
 from nerfvol.kernels import reference
 from nerfvol.native import native
-from nerfvol.octree import Octree
+from nerfvol.octree import BLOCKS, Octree
 
 TILE = 64
 WHITE = (1.0, 1.0, 1.0)
@@ -64,6 +64,9 @@ if native() is not None and "NERFVOL_ISA" in os.environ:
 def _tree(octree: Octree, values: np.ndarray):
     compiled = native()
     assert compiled is not None
+    shape = (octree.n_vertices, 16 * BLOCKS[octree.sh_degree])
+    if values.shape != shape or values.dtype != np.float32:
+        raise ValueError(f"the octree's values must be float32 {shape}, got {values.dtype} {values.shape}")
     return compiled.Tree(
         octree.node_mask,
         octree.leaf_mask,
@@ -84,7 +87,16 @@ def _check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"rays_d must have shape (n, 3), got {d.shape}")
     if o.ndim != 2 or o.shape[1] != 3 or len(o) not in (len(d), -(-len(d) // TILE)):
         raise ValueError(f"rays_o must have one row per ray or one per {TILE} rays of {len(d)}, got shape {o.shape}")
+    for name, a in (("rays_o", o), ("rays_d", d)):
+        if not np.isfinite(np.dot(a.ravel(), a.ravel())):  # one pass; unit directions cannot overflow
+            raise ValueError(f"{name} must be finite, {int((~np.isfinite(a)).any(1).sum())} rows are not")
     return o, d
+
+
+def _check_early_stop(eps) -> float:
+    if not 0 <= eps < 1:  # also refuses NaN
+        raise ValueError(f"early_stop_eps must lie in [0, 1), got {eps}")
+    return float(eps)
 
 
 def _check_background(background) -> list[float]:
@@ -119,7 +131,7 @@ def render_rays(
     by less than that; 0 is exact.
     """
     o, d = _check_rays(rays_o, rays_d)
-    bg = _check_background(background)
+    bg, early_stop_eps = _check_background(background), _check_early_stop(early_stop_eps)
     unknown = set(outputs) - set(OUTPUTS)
     if unknown:
         raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
@@ -198,7 +210,7 @@ def render_values(
     """
     if values.shape != octree.values.shape:
         raise ValueError(f"values must have the octree's shape {octree.values.shape}, got {tuple(values.shape)}")
-    bg = _check_background(background)
+    bg, early_stop_eps = _check_background(background), _check_early_stop(early_stop_eps)
     if values.dtype == torch.float32 and native() is not None:
         o, d = _check_rays(rays_o, rays_d)
         return _Render.apply(values.contiguous(), octree, o, d, bg, float(early_stop_eps))
@@ -255,9 +267,24 @@ class TrainState:
     """
 
     def __init__(self, octree: Octree, moments: np.ndarray | None = None):
-        self.moments = np.zeros_like(octree.values) if moments is None else np.ascontiguousarray(moments)
+        self.moments = np.zeros_like(octree.values) if moments is None else np.ascontiguousarray(moments, np.float32)
         self.slots = np.full(octree.n_vertices, -1, np.int32)
         self.reset_statistics(octree.n_leaves)
+        self.check(octree)
+
+    def check(self, octree: Octree) -> None:
+        """ValueError unless every array fits the octree: the kernels write to them without looking."""
+        leaves = (octree.n_leaves,)
+        for name, shape in (
+            ("moments", octree.values.shape),
+            ("slots", (octree.n_vertices,)),
+            ("max_weight", leaves),
+            ("error", leaves),
+            ("footprint", leaves),
+        ):
+            a, dtype = getattr(self, name), np.int32 if name == "slots" else np.float32
+            if a.shape != shape or a.dtype != dtype or not a.flags.c_contiguous:
+                raise ValueError(f"training state: {name} must be {np.dtype(dtype)} {shape}, got {a.dtype} {a.shape}")
 
     def reset_statistics(self, n_leaves: int) -> None:
         self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
@@ -271,7 +298,8 @@ def train_step(
     Bitwise the same for any number of threads.
     """
     o, d = _check_rays(batch.rays_o, batch.rays_d)
-    bg = _check_background(options.background)
+    bg, eps = _check_background(options.background), _check_early_stop(options.early_stop_eps)
+    state.check(octree)
     if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
         raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")
     if (compiled := native()) is None:
@@ -283,7 +311,7 @@ def train_step(
         batch.target,
         batch.weight,
         bg,
-        float(options.early_stop_eps),
+        eps,
         float(options.colour),
         float(options.distortion),
         float(pixel_angle),
@@ -309,8 +337,8 @@ def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOpt
         slots = np.full(octree.n_vertices, -1, np.int32)
         tree = _tree(octree, values.detach().contiguous().numpy())
         compiled.train_step(
-            tree, o, d, batch.target, batch.weight, _check_background(options.background), float(options.early_stop_eps),
-            float(options.colour), float(options.distortion), 1.0, gradient.numpy(), None, None, [0.0, 0.0, 0.0], 0.0, 0.0,
+            tree, o, d, batch.target, batch.weight, _check_background(options.background),
+            _check_early_stop(options.early_stop_eps), float(options.colour), float(options.distortion), 1.0, gradient.numpy(), None, None, [0.0, 0.0, 0.0], 0.0, 0.0,
             slots, None, None, None,
         )  # fmt: skip
         return gradient
