@@ -216,10 +216,13 @@ def test_subdivide_makes_the_eight_children_and_leaves_the_rest(octree, seed):
 
 @given(octrees(), indices)
 def test_subdivide_keeps_the_field_save_at_vertices_of_finer_neighbours(octree, seed):
-    """The stated bound: where a new corner is no vertex of the old octree its value is the old field's to rounding (eight
-    products by powers of two, exact, and seven additions: 7 u max|v|); where it is one, the vertex keeps its value bit by
-    bit. A leaf's field is a convex combination of its corners, so inside a new leaf it differs from the old field by no
-    more than the largest difference at the leaf's corners: nothing, unless a finer neighbour owned one of them."""
+    """The bound, stated.
+
+    Where a new corner is no vertex of the old octree, its value is the old field's to rounding: eight products by
+    powers of two, exact, and seven additions, 7 u max|v|. Where it is one, the vertex keeps its value bit by bit. A
+    leaf's field is a convex combination of its corners, so inside a new leaf it differs from the old field by no more
+    than the largest difference at the leaf's corners: nothing, unless a finer neighbour owned one of them.
+    """
     finer, transfer = octree.subdivide(masks_for(octree, seed))
     old_vertex = {tuple(p): i for i, p in enumerate(octree.vertex_positions())}
     new_positions = finer.vertex_positions()
