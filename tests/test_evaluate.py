@@ -82,6 +82,9 @@ def test_eval_command(tmp_path, tiny_scene, sphere_octree, command):
     assert code == 0 and "PSNR" in text
     record = json.loads(record_file.read_text())
     assert record["n_images"] == len(record["rows"]) == 2
+    held_out = load_dataset(tiny_scene, "test")
+    background = (0.0, 0.0, 0.0)
+    assert record["psnr"] == pytest.approx(evaluate_octree(sphere_octree, held_out, background)["psnr"], abs=1e-6)
     assert record["background"] == [0.0, 0.0, 0.0] and record["image_size"] == [40, 40]
     assert record["threads"] == 1 and record["split"] == "test" and record["kernel_path"]
     assert record["hardware"]["cpu"] and record["hardware"]["cores"] >= 1
