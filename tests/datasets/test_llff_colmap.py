@@ -102,6 +102,7 @@ def edit(path, change):
     ("images.bin", lambda d: struct.pack("<Q", 2**60) + d[8:], "truncated"),
     ("images.bin", lambda d: d[:72] + b"\xff" + d[73:], "no text"),
     ("images.bin", lambda d: d[:12] + struct.pack("<d", 3.0) + d[20:], "unit quaternion"),
+    ("images.bin", lambda d: d[:12] + struct.pack("<d", 1e200) + d[20:], "unit quaternion"),
     ("images.bin", lambda d: d[:44] + struct.pack("<d", np.nan) + d[52:], "finite translation"),
     ("images.bin", lambda d: d[:68] + struct.pack("<i", 99) + d[72:], "camera 99 is not in the model"),
     ("images.bin", lambda d: struct.pack("<Q", 0), "holds no images"),
@@ -161,6 +162,8 @@ def test_damaged_llff_poses_are_refused(tmp_path, make, sentence):
 
 def test_poses_that_are_no_array_are_refused(tmp_path):
     scenes.write_llff(tmp_path, scenes.ring(), scenes.random_images())
-    (tmp_path / "poses_bounds.npy").write_bytes(b"\x80\x04not an array")
-    with pytest.raises(InputError, match="cannot be read"):
-        load_dataset(tmp_path)
+    whole = (tmp_path / "poses_bounds.npy").read_bytes()
+    for content in (b"\x80\x04not an array", b"", whole[:-8], whole.replace(b"}", b" "), whole.replace(b"<f8", b"<f?")):
+        (tmp_path / "poses_bounds.npy").write_bytes(content)
+        with pytest.raises(InputError, match="cannot be read"):
+            load_dataset(tmp_path)

@@ -212,6 +212,7 @@ BAD_JSON = {
     "infinity in a pose": (bend(0, 0, math.inf), "frame 3.*finite"),
     "scaled pose": (bend(0, 0, 4.0), "frame 3.*must be rigid"),
     "text in a pose": (bend(0, 0, "one"), "frame 3.*4 rows of 4 numbers"),
+    "number beyond floats in a pose": (bend(0, 0, 10**400), "frame 3.*4 rows of 4 numbers"),
     "ragged pose": (put_in_frame("transform_matrix", [[1, 0], [0]]), "frame 3.*4 rows of 4 numbers"),
     "pose of another shape": (put_in_frame("transform_matrix", [[1, 0], [0, 1]]), r"frame 3.*shape \(2, 2\)"),
     "no pose": (lambda data: data["frames"][3].pop("transform_matrix"), "frame 3.*transform_matrix is missing"),
