@@ -1,0 +1,143 @@
+"""Training rays in tiles: whose pixels, in which directions, how often and with which weight."""
+
+import numpy as np
+import pytest
+
+from nerfvol.cameras import Intrinsics, orbit
+from nerfvol.datasets import Dataset, SceneBounds
+from nerfvol.kernels.ops import TILE
+from nerfvol.tiles import Cursor, TileBank
+
+WHITE = (1.0, 1.0, 1.0)
+SCENE = SceneBounds(np.array([[-1.0, -1, -1], [1, 1, 1]]), None, True)
+
+
+def views(sizes, content, seed=0) -> Dataset:
+    """Views of the given sizes, transparent but for a share ``content`` of their rows, which are noise."""
+    generator = np.random.default_rng(seed)
+    cameras, images = [], []
+    for i, (width, height) in enumerate(sizes):
+        lens = Intrinsics(width, height, 1.3 * width, 1.2 * width, 0.45 * width, 0.52 * height, k1=0.02)
+        cameras.append(orbit(len(sizes), center=(0, 0, 0), radius=3, elevation_deg=10, intrinsics=lens)[i])
+        image = np.zeros((height, width, 4), np.uint8)
+        rows = round(content * height)
+        image[:rows] = generator.integers(0, 255, (rows, width, 4))
+        image[:rows, :, 3] = 255
+        images.append(image)
+    return Dataset(cameras, images, [str(i) for i in range(len(sizes))], SCENE, "test")
+
+
+@pytest.fixture(scope="module")
+def odd() -> Dataset:
+    """Three sizes, none a multiple of 8 both ways, content above and plain background below."""
+    return views([(20, 33), (24, 16), (20, 33), (13, 40)], 0.5)
+
+
+def whole_batch(bank: TileBank):
+    return bank.batch(np.arange(bank.n_tiles), np.ones(bank.n_tiles, np.float32))
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_each_pixel_stands_once_with_its_own_ray_and_colour(odd, k):
+    """All tiles together are all pixels, each with the ray that its camera gives it; the rest weighs nothing."""
+    bank = TileBank(odd, WHITE, k)
+    batch = whole_batch(bank)
+    pictures = odd.pyramid(WHITE, k)
+    origins = np.repeat(batch.rays_o, TILE, 0)
+    seen = 0
+    for camera, picture in zip(odd.cameras, pictures, strict=True):
+        origin, directions = camera.scaled(k).rays()
+        rows = np.flatnonzero((origins == origin).all(1) & (batch.weight > 0))
+        assert len(rows) == len(directions)
+        # The kernels' rays and the camera's are the same float32 products in another order: a few roundings apart.
+        order = np.argmax(batch.rays_d[rows] @ directions.T, axis=1)
+        assert np.array_equal(np.sort(order), np.arange(len(directions)))
+        np.testing.assert_allclose(batch.rays_d[rows], directions[order], atol=8 * np.finfo(np.float32).eps)
+        np.testing.assert_array_equal(batch.target[rows], picture.reshape(-1, 3)[order] * np.float32(1 / 255))
+        seen += len(rows)
+    assert seen == (batch.weight > 0).sum() == sum(picture.shape[0] * picture.shape[1] for picture in pictures)
+    np.testing.assert_allclose(np.linalg.norm(batch.rays_d, axis=1), 1, atol=1e-6)
+
+
+def test_rays_of_a_tile_are_neighbours(odd):
+    """Runs of 64 rays share an origin and a block of 8x8 pixels: what the kernels are fast for."""
+    bank = TileBank(odd, WHITE, 1)
+    batch = whole_batch(bank)
+    assert batch.rays_o.shape == (bank.n_tiles, 3) and bank.n_rays == bank.n_tiles * TILE
+    directions = batch.rays_d.reshape(bank.n_tiles, TILE, 3)
+    live = batch.weight.reshape(bank.n_tiles, TILE) > 0
+    assert live[:, 0].all()
+    spread = np.arccos(np.clip((directions * directions[:, :1]).sum(-1), -1, 1))[live].max()
+    assert spread < 8 * np.sqrt(2) * 1.1 / (1.2 * 13)  # the diagonal of 8 pixels of the widest lens
+
+
+def test_plain_tiles_are_the_background_and_nothing_else(odd):
+    white, black = TileBank(odd, WHITE, 1), TileBank(odd, (0.0, 0.0, 0.0), 1)
+    assert 0 < len(white.plain_tiles) < white.n_tiles
+    assert np.array_equal(white.plain_tiles, black.plain_tiles)  # transparent pixels take whatever colour is behind
+    targets = whole_batch(white).target.reshape(white.n_tiles, -1)
+    assert np.array_equal((targets == 1).all(1), white.plain)
+    assert np.array_equal(np.sort(np.concatenate([white.rich_tiles, white.plain_tiles])), np.arange(white.n_tiles))
+
+
+def drawn(bank: TileBank, n: int, count: int, share: float = 0.6, seed: int = 5):
+    rich, plain = Cursor(), Cursor()
+    return [bank.draw(n, share, seed, rich, plain) for _ in range(count)], rich, plain
+
+
+def test_the_expected_loss_is_the_mean_over_all_pixels(odd):
+    """Over whole epochs of both queues, weights times errors add up to the mean over pixels, whatever the share."""
+    bank = TileBank(odd, WHITE, 1)
+    n_rich, n_plain = len(bank.rich_tiles), len(bank.plain_tiles)
+    share = 0.75
+    steps = n_rich * n_plain  # 4 tiles a step: 3 rich, 1 plain; whole epochs of both
+    everything = whole_batch(bank)
+    error = (everything.target**2).mean(-1)
+    wanted = (error * everything.weight).sum() / bank.n_tiles
+    batches, rich, plain = drawn(bank, 4, steps, share)
+    assert (rich.epoch, rich.position, plain.epoch, plain.position) == (3 * n_plain, 0, n_rich, 0)
+    found = np.mean([((b.target**2).mean(-1) * b.weight).sum() / 4 for b in batches])
+    assert found == pytest.approx(wanted, rel=1e-5)
+    assert np.mean([b.weight.sum() for b in batches]) == pytest.approx(4 * everything.weight.mean() * TILE, rel=1e-5)
+
+
+def test_an_epoch_visits_each_tile_once_and_orders_differ(odd):
+    bank = TileBank(odd, WHITE, 1)
+    n = len(bank.rich_tiles)
+    rich, plain = Cursor(), Cursor()
+    epochs = []
+    for _ in range(2):
+        order = [tuple(bank.draw(1, 1.0, 3, rich, plain).rays_d[0]) for _ in range(n)]
+        assert len(set(order)) == n
+        epochs.append(order)
+    assert epochs[0] != epochs[1] and set(epochs[0]) == set(epochs[1])
+    other = [tuple(bank.draw(1, 1.0, 4, *cursors).rays_d[0]) for cursors in [(Cursor(), Cursor())] for _ in range(n)]
+    assert other != epochs[0]
+
+
+def test_the_cursors_are_all_there_is_to_remember(odd):
+    """A bank made anew with the cursors of the old one goes on with the same tiles, also across epochs."""
+    batches, *_ = drawn(TileBank(odd, WHITE, 1), 7, 12)
+    rich, plain = Cursor(), Cursor()
+    for i, expected in enumerate(batches):
+        rich, plain = Cursor(rich.epoch, rich.position), Cursor(plain.epoch, plain.position)
+        batch = TileBank(odd, WHITE, 1).draw(7, 0.6, 5, rich, plain)
+        for name in ("rays_o", "rays_d", "target", "weight"):
+            assert np.array_equal(getattr(batch, name), getattr(expected, name)), (i, name)
+
+
+@pytest.mark.parametrize("content", [0.0, 1.0])
+def test_only_plain_or_only_rich_tiles(content):
+    """With one of the queues empty the other fills the batch, at weight 1."""
+    dataset = views([(16, 16), (16, 24)], content)
+    bank = TileBank(dataset, WHITE, 1)
+    assert (len(bank.rich_tiles) == 0) == (content == 0)
+    batch = bank.draw(6, 0.8, 0, Cursor(), Cursor())
+    assert batch.rays_o.shape == (6, 3) and (batch.weight == 1).all()
+
+
+def test_the_angle_of_a_pixel(odd):
+    one, two = TileBank(odd, WHITE, 1), TileBank(odd, WHITE, 2)
+    assert one.pixel_angle == pytest.approx(np.median([1 / (1.3 * w) for w in (20, 24, 20, 13)]))
+    # A scaled lens drops what does not fill a block, but its focal length is exactly half.
+    assert two.pixel_angle == pytest.approx(2 * one.pixel_angle)
