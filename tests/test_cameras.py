@@ -275,7 +275,7 @@ def test_poses_that_are_not_rigid_are_refused(kind, sentence):
 
 
 @pytest.mark.parametrize("change,sentence", [
-    ({"fx": 0.0}, "positive"), ({"fy": -3.0}, "positive"), ({"fy": 1e-320}, "positive"), 
+    ({"fx": 0.0}, "positive"), ({"fy": -3.0}, "positive"), ({"fy": 1e-320}, "positive"),
     ({"fx": math.nan}, "fx must be a finite"),
     ({"cx": math.inf}, "cx must be a finite"), ({"k3": math.nan}, "k3 must be a finite"),
     ({"width": 0}, "at least 1x1"), ({"fisheye": True, "p1": 0.1}, "no tangential"),

@@ -163,7 +163,10 @@ def test_damaged_llff_poses_are_refused(tmp_path, make, sentence):
 def test_poses_that_are_no_array_are_refused(tmp_path):
     scenes.write_llff(tmp_path, scenes.ring(), scenes.random_images())
     whole = (tmp_path / "poses_bounds.npy").read_bytes()
-    for content in (b"\x80\x04not an array", b"", whole[:-8], whole.replace(b"}", b" "), whole.replace(b"<f8", b"<f?")):
+    huge = whole.replace(b"(9, 17), }               ", b"(9999999999999999, 17), }")
+    assert len(huge) == len(whole) and huge != whole
+    broken = [whole[:-8], whole.replace(b"}", b" "), whole.replace(b"<f8", b"<f?"), huge]
+    for content in (b"\x80\x04not an array", b"", *broken):
         (tmp_path / "poses_bounds.npy").write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             load_dataset(tmp_path)
