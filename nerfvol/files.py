@@ -33,7 +33,8 @@ _REASONS = {
 
 def explain_os_error(error: OSError) -> str:
     """The cause of ``error`` in a few words, without numbers or class names."""
-    return _REASONS.get(error.errno or 0, error.strerror or str(error))
+    lines = (error.strerror or str(error)).strip().splitlines() or [type(error).__name__]
+    return _REASONS.get(error.errno or 0, lines[0])
 
 
 @contextlib.contextmanager

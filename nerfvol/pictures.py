@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -67,24 +68,80 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Float]) -> No
 
 
 class VideoWriter:
-    """Frames to an H.264 MP4 that every browser plays (yuv420p; odd sizes lose their last row or column)."""
+    """Frames to an H.264 MP4 that every browser plays (yuv420p; odd sizes lose their last row or column).
+
+    Speaks to the ffmpeg program itself: it must say that it wrote everything, which imageio's writer does not ask.
+    """
 
     def __init__(self, path: Path, fps: int):
-        import imageio.v2 as imageio
-
-        self._writer = imageio.get_writer(
-            path, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
-        )
+        self._path, self._fps = path, fps
+        self._process: subprocess.Popen[bytes] | None = None
+        self._size = (0, 0)
 
     def add(self, image: NDArray[Any]) -> None:
-        """Append an (H, W, 3) frame of values in [0, 1] or uint8."""
+        """Append an (H, W, 3) frame of values in [0, 1] or uint8, all of one size, at least 2x2.
+
+        Raises:
+            OSError: ffmpeg has given up (disk full, for one).
+        """
         pixels = image if image.dtype == np.uint8 else to_uint8(image)
         height, width = pixels.shape[0] // 2 * 2, pixels.shape[1] // 2 * 2
-        self._writer.append_data(np.ascontiguousarray(pixels[:height, :width]))
+        if self._process is None:
+            if min(height, width) < 2:
+                size = f"{pixels.shape[1]}x{pixels.shape[0]}"
+                raise InputError(f"a video needs frames of at least 2x2 pixels, got {size}")
+            self._size = (height, width)
+            self._process = self._start(width, height)
+        if (height, width) != self._size:
+            raise ValueError(f"frames of one video must have one size, got {(height, width)} after {self._size}")
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(np.ascontiguousarray(pixels[:height, :width]).tobytes())
+        except BrokenPipeError as error:
+            raise self._failure() from error
 
     def close(self) -> None:
-        """Finish the file."""
-        self._writer.close()
+        """Finish the file; OSError where ffmpeg could not."""
+        if self._process is None:
+            return
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # its exit code tells
+            self._process.stdin.close()
+        if self._process.wait() != 0:
+            raise self._failure()
+        self._release()
+
+    def abandon(self) -> None:
+        """Stop without finishing."""
+        if self._process is not None:
+            self._process.kill()
+            self._release()
+
+    def _start(self, width: int, height: int) -> subprocess.Popen[bytes]:
+        import imageio_ffmpeg
+
+        frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(self._fps), "-i", "-"]
+        video = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(self._path)]
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *frames, *video]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+    def _failure(self) -> OSError:
+        """What ffmpeg said last, as an error about the file."""
+        assert self._process is not None and self._process.stderr is not None
+        self._process.wait()
+        lines = self._process.stderr.read().decode(errors="replace").strip().splitlines()
+        self._release()
+        return OSError(None, f"ffmpeg stopped ({lines[-1] if lines else 'without a word'})", str(self._path))
+
+    def _release(self) -> None:
+        if self._process is None:
+            return
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stderr):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):  # what it did not take is lost with it
+                    pipe.close()
+        self._process = None
 
 
 @contextlib.contextmanager
@@ -94,8 +151,9 @@ def open_video(path: str | os.PathLike[str], fps: int) -> Iterator[VideoWriter]:
         writer = VideoWriter(temporary, fps)
         try:
             yield writer
-        finally:
             writer.close()
+        finally:
+            writer.abandon()
 
 
 def depth_to_grey(depth: Float, opacity: Float, near: float, far: float) -> Float:

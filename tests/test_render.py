@@ -2,6 +2,9 @@
 
 import json
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -147,8 +150,6 @@ def test_exr_round_trip(tmp_path):
 
 
 def test_video_frames_come_back(tmp_path):
-    import subprocess
-
     import imageio_ffmpeg
 
     path = tmp_path / "v.mp4"
@@ -163,6 +164,17 @@ def test_video_frames_come_back(tmp_path):
     for frame, level in zip(frames, (0.1, 0.5, 0.9), strict=True):
         assert abs(frame.mean() / 255 - level) < 0.02  # lossy, and limited-range chroma
     assert [p.name for p in tmp_path.iterdir()] == ["v.mp4"]
+
+
+def test_video_frames_must_fit(tmp_path):
+    with pytest.raises(InputError, match="at least 2x2 pixels, got 1x9"):
+        with pictures.open_video(tmp_path / "v.mp4", fps=10) as video:
+            video.add(np.zeros((9, 1, 3), np.float32))
+    with pytest.raises(ValueError, match="one size"):
+        with pictures.open_video(tmp_path / "v.mp4", fps=10) as video:
+            video.add(np.zeros((16, 16, 3), np.float32))
+            video.add(np.zeros((16, 18, 3), np.float32))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_failed_video_leaves_nothing(tmp_path):
@@ -317,6 +329,20 @@ def test_render_exr_and_video(tmp_path, octree_file, command):
         "render", octree_file, "--orbit", 4, "--size", "32x32", "--out", tmp_path / "v.mp4", "--aov", "depth"
     )
     assert code == 0 and (tmp_path / "v.mp4").stat().st_size > 500 and (tmp_path / "v_depth.mp4").is_file()
+
+
+@pytest.mark.parametrize("out", ["views", "v.mp4"])
+def test_a_disk_that_takes_no_more(tmp_path, octree_file, out):
+    """A limit on file size, set by the operating system as a full disk would be: one sentence, no half files."""
+    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); from nerfvol import cli; "
+    arguments = ["render", str(octree_file), "--orbit", "3", "--size", "64x64", "--out", str(tmp_path / out)]
+    root = Path(render.__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-c", limited + f"sys.exit(cli.main({arguments}))"], cwd=root, capture_output=True, text=True
+    )
+    assert done.returncode == 2 and done.stderr.startswith("nerfvol: error: cannot write"), done.stderr
+    assert done.stderr.count("\n") == 1 and len(done.stderr) < 300 and str(tmp_path / out) in done.stderr
+    assert {path.name for path in tmp_path.rglob("*")} <= {"o.safetensors", "views"}
 
 
 @pytest.mark.parametrize(
