@@ -29,27 +29,31 @@ struct PointGradient {
     int32_t lane;
 };
 
-// What phase 1 leaves of one packet. Kept between steps to spare the allocations.
-struct PacketRecord {
-    std::unique_ptr<PointGradient[]> points;
-    size_t capacity = 0;
-    std::vector<Visit> visits;
-    std::vector<int32_t> first_hit;       // of each visit
-    std::vector<int32_t> order;           // visits grouped by bucket (a visit that straddles stands in several groups)
-    int32_t offset[kBuckets + 1];
-    alignas(64) float basis[kTile * 64];  // rows of BasisRows, 16 * B floats each
-    StepReport report;
-
-    void reserve(size_t n) {
-        if (n <= capacity) return;
-        capacity = n + n / 4;
-        points.reset(new PointGradient[capacity]);
-    }
+// A visited leaf, for phase 2. Self-contained, so that phase 2 reads records in a row and nothing else of phase 1's.
+struct LeafGradient {
+    int32_t corners[8];
+    int32_t leaf, n_points;
+    float max_weight, error, near, side;
 };
 
-// The hits of the packet in work. Reused by a thread, so that they stay in its cache.
-struct HitList {
+// What phase 1 leaves of one packet, grouped by bucket: a leaf whose corners lie in several stands in several groups. Kept
+// between steps to spare the allocations.
+struct PacketRecord {
+    std::vector<LeafGradient> leaves;
+    std::unique_ptr<PointGradient[]> points;
+    size_t capacity = 0;
+    int32_t first_leaf[kBuckets + 1], first_point[kBuckets + 1];
+    alignas(64) float basis[kTile * 64];  // rows of BasisRows, 16 * B floats each
+    StepReport report;
+};
+
+// The packet in work: hits front to back, the leaves they lie in, their gradients. Reused by a thread, so that it stays in
+// its cache.
+struct Workspace {
     std::unique_ptr<Hit[]> hits;
+    std::unique_ptr<PointGradient[]> points;
+    std::vector<Visit> visits;
+    std::vector<int32_t> first_hit;       // of each visit
     size_t size = 0, capacity = 0;
 
     Hit* append(size_t n) {
@@ -58,6 +62,7 @@ struct HitList {
             std::unique_ptr<Hit[]> larger(new Hit[capacity]);
             std::copy(hits.get(), hits.get() + size, larger.get());
             hits = std::move(larger);
+            points.reset(new PointGradient[capacity]);
         }
         size += n;
         return hits.get() + size - n;
@@ -71,17 +76,16 @@ inline int bucket_shift(int64_t n_vertices) {
 }
 
 template <int B>
-void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, HitList& list,
-                    PacketRecord& rec) {
+void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, Workspace& work) {
     Extinction x;
-    list.size = 0;
-    rec.visits.clear();
-    rec.first_hit.clear();
+    work.size = 0;
+    work.visits.clear();
+    work.first_hit.clear();
     start(state);
     march<B>(tree, p, basis, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const float* const* rows, const BasisRows<B>& b) {
         const int m = __builtin_popcountll(hits);
-        const size_t base = list.size;
-        Hit* h = list.append(size_t(m));
+        const size_t base = work.size;
+        Hit* h = work.append(size_t(m));
         int i = 0;
         for (uint64_t rest = hits; rest; rest &= rest - 1, ++i) {
             const int l = __builtin_ctzll(rest);
@@ -108,8 +112,8 @@ void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, floa
             visit.near = std::min(visit.near, h[i].middle);
             if (h[i].trans_after < eps) p.alive &= ~(1ull << l);
         }
-        rec.visits.push_back(visit);
-        rec.first_hit.push_back(int32_t(base));
+        work.visits.push_back(visit);
+        work.first_hit.push_back(int32_t(base));
     });
 }
 
@@ -165,14 +169,13 @@ inline void adjoint_of_loss(const Loss& loss, const PacketState& s, int64_t firs
     }
 }
 
-// Back to front: dL/d(r, g, b, raw density) of each hit, into the record.
-inline void backward_packet(const HitList& list, PacketRecord& rec, Adjoint& a, float per_length) {
-    rec.reserve(list.size);
+// Back to front: dL/d(r, g, b, raw density) of each hit.
+inline void backward_packet(Workspace& work, Adjoint& a, float per_length) {
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
-    for (size_t v = rec.visits.size(); v-- > 0;) {
-        Visit& visit = rec.visits[v];
-        const Hit* h = list.hits.get() + rec.first_hit[v];
-        PointGradient* point = rec.points.get() + rec.first_hit[v];
+    for (size_t v = work.visits.size(); v-- > 0;) {
+        Visit& visit = work.visits[v];
+        const Hit* h = work.hits.get() + work.first_hit[v];
+        PointGradient* point = work.points.get() + work.first_hit[v];
         for (int i = 0; i < visit.n_hits; ++i) {
             const int l = h[i].lane;
             const float w = h[i].weight;
@@ -204,14 +207,15 @@ inline void backward_packet(const HitList& list, PacketRecord& rec, Adjoint& a, 
     }
 }
 
-inline void group_by_bucket(const Tree& tree, int shift, PacketRecord& rec) {
-    std::memset(rec.offset, 0, sizeof(rec.offset));
-    const int n = int(rec.visits.size());
-    auto buckets = [&](int v, int32_t* out) {  // distinct buckets of a visit's corners
-        const int32_t* c = tree.corners + 8 * int64_t(rec.visits[size_t(v)].leaf);
+// Copies visits and their gradients into the record, bucket by bucket, in the order of the walk within each.
+inline void group_by_bucket(const Tree& tree, int shift, const Workspace& work, PacketRecord& rec) {
+    std::memset(rec.first_leaf, 0, sizeof(rec.first_leaf));
+    std::memset(rec.first_point, 0, sizeof(rec.first_point));
+    const size_t n = work.visits.size();
+    const auto distinct_buckets = [&](const int32_t* corners, int32_t* out) {
         int m = 0;
         for (int o = 0; o < 8; ++o) {
-            const int32_t b = c[o] >> shift;
+            const int32_t b = corners[o] >> shift;
             bool known = false;
             for (int j = 0; j < m; ++j) known |= out[j] == b;
             if (!known) out[m++] = b;
@@ -219,15 +223,35 @@ inline void group_by_bucket(const Tree& tree, int shift, PacketRecord& rec) {
         return m;
     };
     int32_t b[8];
-    for (int v = 0; v < n; ++v)
-        for (int j = buckets(v, b); j-- > 0;) ++rec.offset[b[j] + 1];
-    for (int k = 0; k < kBuckets; ++k) rec.offset[k + 1] += rec.offset[k];
-    rec.order.resize(size_t(rec.offset[kBuckets]));
-    int32_t at[kBuckets];
-    std::memcpy(at, rec.offset, sizeof(at));
-    for (int v = 0; v < n; ++v) {
-        const int m = buckets(v, b);
-        for (int j = 0; j < m; ++j) rec.order[size_t(at[b[j]]++)] = v;
+    for (size_t v = 0; v < n; ++v)
+        for (int j = distinct_buckets(tree.corners + 8 * int64_t(work.visits[v].leaf), b); j-- > 0;) {
+            ++rec.first_leaf[b[j] + 1];
+            rec.first_point[b[j] + 1] += work.visits[v].n_hits;
+        }
+    for (int k = 0; k < kBuckets; ++k) {
+        rec.first_leaf[k + 1] += rec.first_leaf[k];
+        rec.first_point[k + 1] += rec.first_point[k];
+    }
+    rec.leaves.resize(size_t(rec.first_leaf[kBuckets]));
+    if (size_t(rec.first_point[kBuckets]) > rec.capacity) {
+        rec.capacity = size_t(rec.first_point[kBuckets]) * 5 / 4;
+        rec.points.reset(new PointGradient[rec.capacity]);
+    }
+    int32_t leaf_at[kBuckets], point_at[kBuckets];
+    std::memcpy(leaf_at, rec.first_leaf, sizeof(leaf_at));
+    std::memcpy(point_at, rec.first_point, sizeof(point_at));
+    for (size_t v = 0; v < n; ++v) {
+        const Visit& visit = work.visits[v];
+        const int32_t* corners = tree.corners + 8 * int64_t(visit.leaf);
+        LeafGradient out = {{}, visit.leaf, visit.n_hits, visit.max_weight, visit.error, visit.near, visit.side};
+        std::memcpy(out.corners, corners, sizeof(out.corners));
+        const PointGradient* points = work.points.get() + work.first_hit[v];
+        const int m = distinct_buckets(corners, b);
+        for (int j = 0; j < m; ++j) {
+            rec.leaves[size_t(leaf_at[b[j]]++)] = out;
+            std::copy(points, points + visit.n_hits, rec.points.get() + point_at[b[j]]);
+            point_at[b[j]] += visit.n_hits;
+        }
     }
 }
 
@@ -247,19 +271,19 @@ template <int B> struct Sums {
     }
 };
 
-template <int B> void add_visit(const Tree& tree, const PacketRecord& rec, int v, int bucket, int shift, int32_t* slots, Sums<B>& sums) {
-    const Visit& visit = rec.visits[size_t(v)];
-    const PointGradient* h = rec.points.get() + rec.first_hit[size_t(v)];
+template <int B>
+void add_leaf(const LeafGradient& leaf, const PointGradient* h, const float* basis_rows, int bucket, int shift, int32_t* slots,
+              Sums<B>& sums) {
     f16 corner[8][B];
     for (int o = 0; o < 8; ++o)
         for (int k = 0; k < B; ++k) corner[o][k] = f16{};
-    for (int i = 0; i < visit.n_hits; ++i) {
+    for (int i = 0; i < leaf.n_points; ++i) {
         alignas(32) float w[8];
         store(w, trilinear(h[i].fx, h[i].fy, h[i].fz));
         keep_in_memory(w);
         const f4 v4 = h[i].value;
         const f16 g = __builtin_shufflevector(v4, v4, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
-        const float* basis = rec.basis + 16 * B * h[i].lane;
+        const float* basis = basis_rows + 16 * B * h[i].lane;
         for (int k = 0; k < B; ++k) {
             f16 b = load<f16>(basis + 16 * k);
             f16 gk = g;
@@ -268,10 +292,9 @@ template <int B> void add_visit(const Tree& tree, const PacketRecord& rec, int v
             for (int o = 0; o < 8; ++o) corner[o][k] += w[o] * gk;
         }
     }
-    const int32_t* c = tree.corners + 8 * int64_t(visit.leaf);
     for (int o = 0; o < 8; ++o) {
-        if (c[o] >> shift != bucket) continue;
-        float* row = sums.row(c[o], slots);
+        if (leaf.corners[o] >> shift != bucket) continue;
+        float* row = sums.row(leaf.corners[o], slots);
         for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(row + 16 * k) + corner[o][k]);
     }
 }
@@ -286,8 +309,8 @@ template <int B> void apply(const GradientSink& sink, Sums<B>& sums) {
     for (int i = 0; i < n; ++i) {
         const int32_t vertex = sums.touched[size_t(i)];
         const int64_t at = 16 * B * int64_t(vertex);
-        if (sink.optimizer && i + 4 < n) {
-            const int64_t ahead = 16 * B * int64_t(sums.touched[size_t(i) + 4]);
+        if (sink.optimizer && i + 8 < n) {
+            const int64_t ahead = 16 * B * int64_t(sums.touched[size_t(i) + 8]);
             for (int k = 0; k < B; ++k) {
                 __builtin_prefetch(sink.optimizer->moments + ahead + 16 * k, 1);
                 __builtin_prefetch(sink.optimizer->values + ahead + 16 * k, 1);
@@ -316,13 +339,12 @@ template <int B> void apply(const GradientSink& sink, Sums<B>& sums) {
     sums.rows.clear();
 }
 
-inline void add_statistics(const PacketRecord& rec, const Visit& visit, const LeafStatistics& out, float pixel_angle) {
-    (void)rec;
-    float& w = out.max_weight[visit.leaf];
-    w = std::max(w, visit.max_weight);
-    out.error[visit.leaf] += visit.error;
-    float& f = out.footprint[visit.leaf];
-    f = std::max(f, visit.side / (std::max(visit.near, 1e-6f) * pixel_angle));
+inline void add_statistics(const LeafGradient& leaf, const LeafStatistics& out, float pixel_angle) {
+    float& w = out.max_weight[leaf.leaf];
+    w = std::max(w, leaf.max_weight);
+    out.error[leaf.leaf] += leaf.error;
+    float& f = out.footprint[leaf.leaf];
+    f = std::max(f, leaf.side / (std::max(leaf.near, 1e-6f) * pixel_angle));
 }
 
 template <int B>
@@ -359,32 +381,28 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         basis.fill(p, tree.sh_degree);
         for (int l = 0; l < count; ++l) std::memcpy(rec.basis + 16 * B * l, basis.row[l], sizeof(basis.row[l]));
         PacketState state;
-        static thread_local HitList list;
-        forward_packet<B>(tree, p, basis, options.early_stop_eps, state, list, rec);
+        static thread_local Workspace workspace;
+        Workspace& work = workspace;
+        forward_packet<B>(tree, p, basis, options.early_stop_eps, state, work);
         Adjoint adjoint;
-        rec.report = {0, 0, double(list.size)};
+        rec.report = {0, 0, double(work.size)};
         if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
         else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
-        backward_packet(list, rec, adjoint, 1.0f / tree.size);
-        group_by_bucket(tree, shift, rec);
+        backward_packet(work, adjoint, 1.0f / tree.size);
+        group_by_bucket(tree, shift, work, rec);
     });
 
     nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
-        static thread_local Sums<B> sums;
+        static thread_local Sums<B> per_thread;
+        Sums<B>& sums = per_thread;
         for (int i = 0; i < n; ++i) {
             const PacketRecord& rec = *records[size_t(i)];
-            for (int32_t k = rec.offset[bucket]; k < rec.offset[bucket + 1]; ++k) {
-                const int v = rec.order[size_t(k)];
-                const Visit& visit = rec.visits[size_t(v)];
-                if (k + 3 < rec.offset[bucket + 1]) {  // records lie scattered: ask for the ones to come
-                    const size_t next = size_t(rec.order[size_t(k) + 3]);
-                    for (int j = 0; j < rec.visits[next].n_hits; j += 2)
-                        __builtin_prefetch(rec.points.get() + rec.first_hit[next] + j);
-                    __builtin_prefetch(tree.corners + 8 * int64_t(rec.visits[next].leaf));
-                }
-                add_visit<B>(tree, rec, v, bucket, shift, sink.slots, sums);
-                if (statistics.max_weight && tree.corners[8 * int64_t(visit.leaf)] >> shift == bucket)
-                    add_statistics(rec, visit, statistics, pixel_angle);
+            const PointGradient* points = rec.points.get() + rec.first_point[bucket];
+            for (int32_t k = rec.first_leaf[bucket]; k < rec.first_leaf[bucket + 1]; ++k) {
+                const LeafGradient& leaf = rec.leaves[size_t(k)];
+                add_leaf<B>(leaf, points, rec.basis, bucket, shift, sink.slots, sums);
+                points += leaf.n_points;
+                if (statistics.max_weight && leaf.corners[0] >> shift == bucket) add_statistics(leaf, statistics, pixel_angle);
             }
         }
         apply<B>(sink, sums);
