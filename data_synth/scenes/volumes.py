@@ -7,9 +7,10 @@ import numpy as np
 from data_synth import clouds, lights, materials, media, phase, surfaces
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError
-from data_synth.jit import in_bands, kernel
-from data_synth.noise import cloud_textures, texture_at
+from data_synth.jit import in_bands
+from data_synth.noise import cloud_textures
 from data_synth.scene import Scene
+from data_synth.scenes.procedural import fill_fireball, fill_plume
 from data_synth.volumes import read_volume
 
 CLOUD_PHASE = phase.two_lobes(0.6, -0.25, 0.6)
@@ -27,7 +28,7 @@ def cloud(
     return Scene(
         medium=medium,
         lights=[
-            lights.directional((1.0, -0.45, 0.38), (34.0, 19.0, 9.5)),
+            lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5)),
             lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5)),
         ],
         viewpoints=Viewpoints(radius=4.6, elevation=(-5, 60), fov=40),
@@ -79,7 +80,7 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
         n = resolution
         rho = np.empty((int(n * 2 / 3), int(n * 2 / 3), n), np.float32)
         detail = cloud_textures(seed, 64).base
-        in_bands(lambda a, b: _plume(detail, rho, a, b), rho.shape[0], 4)
+        in_bands(lambda a, b: fill_plume(detail, rho, a, b), rho.shape[0], 4)
     else:
         rho, lo, hi = _imported(volume, None, lo, hi, up="y")
     medium = media.grid(rho, lo, hi, density, (0.92, 0.90, 0.88), phase=phase.henyey_greenstein(0.3))
@@ -95,33 +96,12 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
     )
 
 
-@kernel
-def _plume(t, out, first, last):
-    """A column that widens and curls as it rises: noise of noise, cut out of a cone."""
-    nx, ny, nz = out.shape
-    for i in range(first, last):
-        for j in range(ny):
-            for k in range(nz):
-                x, y, z = i / (nx - 1) - 0.5, j / (ny - 1) - 0.5, k / (nz - 1)
-                bend = 0.16 * z
-                wx = texture_at(t, 0.7 * x + 0.1, 0.7 * y, 0.55 * z - 0.1, 0) - 0.55
-                wy = texture_at(t, 0.7 * x + 0.5, 0.7 * y + 0.3, 0.55 * z + 0.2, 0) - 0.55
-                px, py = x + 1.3 * bend * wx, y + 1.3 * bend * wy
-                radius = 0.07 + 0.30 * z**0.8
-                r = (px * px + py * py) ** 0.5 / radius
-                billow = texture_at(t, 1.1 * px, 1.1 * py, 0.9 * z, 1)
-                billow += 0.5 * texture_at(t, 2.3 * px, 2.3 * py, 2.0 * z, 2)
-                edge = 1.35 * billow + 0.42 - r
-                fade = min(1.0, 12.0 * z) * min(1.0, 5.0 * (1.0 - z))
-                out[i, j, k] = min(max(2.2 * edge, 0.0), 1.0) * fade * (1.0 - 0.65 * z)
-
-
 def explosion(density: float = 16.0, heat: float = 16.0, resolution: int = 128, seed: int = 4) -> Scene:
     """a fireball: soot that glows as a black body where it is hot"""
     n = resolution
     rho, hot = np.empty((n, n, n), np.float32), np.empty((n, n, n), np.float32)
     t = cloud_textures(seed, 64).base
-    in_bands(lambda a, b: _fireball(t, rho, hot, a, b), n, 4)
+    in_bands(lambda a, b: fill_fireball(t, rho, hot, a, b), n, 4)
     kelvin = np.linspace(0.0, 1.0, 32)
     glow = np.stack([kelvin**2.2, 0.48 * kelvin**3.6, 0.16 * kelvin**6.5], axis=1) * heat
     medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.35, glow, attribute=hot)
@@ -132,24 +112,6 @@ def explosion(density: float = 16.0, heat: float = 16.0, resolution: int = 128, 
         integrators=("deep", "march", "path", "emission"),
         aabb=np.array([[-1.2] * 3, [1.2] * 3]),
     )
-
-
-@kernel
-def _fireball(t, rho, hot, first, last):
-    n = rho.shape[0]
-    for i in range(first, last):
-        for j in range(n):
-            for k in range(n):
-                x, y, z = 2.0 * i / (n - 1) - 1.0, 2.0 * j / (n - 1) - 1.0, 2.0 * k / (n - 1) - 1.0
-                r = (x * x + y * y + z * z) ** 0.5
-                big = texture_at(t, 0.40 * x, 0.40 * y, 0.40 * z, 1)
-                small = texture_at(t, 0.9 * x, 0.9 * y, 0.9 * z, 1)
-                surface = 0.30 + 0.72 * big + 0.20 * small
-                d = surface - r
-                rho[i, j, k] = min(max(7.0 * d, 0.0), 1.0) * min(1.0, 6.0 * (1.0 - r) if r < 1.0 else 0.0)
-                crack = 1.2 - 1.7 * texture_at(t, 0.35 * x + 0.3, 0.35 * y, 0.35 * z, 1)
-                crack += 0.35 - 0.9 * texture_at(t, 0.9 * x, 0.9 * y + 0.4, 0.9 * z, 2)
-                hot[i, j, k] = min(max(0.62 * crack - 0.30 * r - 0.2 * z - 1.5 * max(0.08 - d, 0.0) + 0.22, 0.0), 1.0)
 
 
 def phantom(density: float = 40.0, resolution: int = 128, volume: str | None = None) -> Scene:
