@@ -24,13 +24,13 @@ from nerfvol.tiles import Cursor, TileBank
 class OctreeConfig:
     """Settings of the octree's optimisation. Shares of progress lie in [0, 1]."""
 
-    steps: int = 14000
+    steps: int = 9000
     """Optimiser steps of the whole schedule when no time budget is given."""
     levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9])
     """Finest level of each stage: level 8 means 256 cells along the region of detail."""
     downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1])
     """Image downscale of each stage."""
-    until: list[float] = field(default_factory=lambda: [0.005, 0.01, 0.03, 0.10, 0.35, 1.0])
+    until: list[float] = field(default_factory=lambda: [0.003, 0.008, 0.03, 0.11, 0.40, 1.0])
     """Share of progress at which each stage ends."""
     tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 320, 320, 320])
     """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
@@ -62,6 +62,8 @@ class OctreeConfig:
     subdivide_error: float = 0.97
     """... and only the fewest leaves that hold this share of the squared error."""
     choosy_from: int = 9
+    fine_steps: int = 1500
+    """A stage from level ``choosy_from`` on is left out where fewer steps would be left for it: it would only blur."""
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""
 
@@ -69,7 +71,9 @@ class OctreeConfig:
 class OctreeTrainer:
     """Optimises an octree on a dataset. ``progress`` runs from 0 to 1 and drives every schedule."""
 
-    def __init__(self, dataset: Dataset, background: Sequence[float], config: OctreeConfig, seed: int, octree: Octree | None):
+    def __init__(
+        self, dataset: Dataset, background: Sequence[float], config: OctreeConfig, seed: int, octree: Octree | None
+    ):
         n = len(config.levels)
         for name in ("downscales", "until", "tiles", "prunes"):
             if len(getattr(config, name)) != n:
@@ -133,7 +137,7 @@ class OctreeTrainer:
         c = self.config
         progress = self._start + progress * (1 - self._start)
         if progress >= c.until[self.stage] and self.stage + 1 < len(c.levels):
-            if self.prunings == c.prunes[self.stage] and self._seen_enough():
+            if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
                 self.next_stage()
         self._prune_inside_stage(progress)
         if self.bank is None:
@@ -169,6 +173,12 @@ class OctreeTrainer:
             self.bank = None
             self.rich, self.plain = Cursor(), Cursor()
 
+    def _worth_splitting(self, progress: float) -> bool:
+        """Whether the next stage, if it is a fine one, will have the steps that it needs at the pace so far."""
+        c = self.config
+        left = self.step_count * (1 - progress) / max(progress - self._start, 1e-9)
+        return c.levels[self.stage + 1] < c.choosy_from or left >= c.fine_steps
+
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
         c = self.config
@@ -178,7 +188,11 @@ class OctreeTrainer:
         c = self.config
         start = c.until[self.stage - 1] if self.stage else 0.0
         due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
-        if self.prunings < c.prunes[self.stage] and progress >= start + due * (c.until[self.stage] - start) and self._seen_enough():
+        if (
+            self.prunings < c.prunes[self.stage]
+            and progress >= start + due * (c.until[self.stage] - start)
+            and self._seen_enough()
+        ):
             self.prune()
             self.prunings += 1
 

@@ -138,7 +138,9 @@ class Octree:
         self.sh_degree = int(sh_degree)
         self.density_scale = float(density_scale)
         _check_frame(self)
-        self.first_node, self.first_leaf, self.leaf_level, self.leaf_ijk = _expand_topology(self.node_mask, self.leaf_mask)
+        self.first_node, self.first_leaf, self.leaf_level, self.leaf_ijk = _expand_topology(
+            self.node_mask, self.leaf_mask
+        )
         self.corners, self._vertex_ijk = _number_corners(self.leaf_level, self.leaf_ijk)
         self.values = np.zeros((len(self._vertex_ijk), 16 * BLOCKS[self.sh_degree]), dtype=np.float32)
         self.values[:, DENSITY_SLOT] = EMPTY_DENSITY
@@ -163,9 +165,7 @@ class Octree:
         if (ijk < 0).any() or (ijk >= (1 << level)[:, None]).any():
             raise InputError("leaf positions must lie in [0, 2**level), some do not")
         node_mask, leaf_mask = _build_masks(level, ijk)
-        return cls(
-            node_mask, leaf_mask, origin=origin, size=size, sh_degree=sh_degree, density_scale=density_scale
-        )
+        return cls(node_mask, leaf_mask, origin=origin, size=size, sh_degree=sh_degree, density_scale=density_scale)
 
     # ------------------------------------------------------------------ sizes and places
     @property
@@ -365,7 +365,9 @@ def _build_masks(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.nda
 def _expand_topology(node_mask: np.ndarray, leaf_mask: np.ndarray):
     """first_node, first_leaf, leaf_level, leaf_ijk from the masks; InputError where they describe no octree."""
     if node_mask.ndim != 1 or node_mask.shape != leaf_mask.shape or len(node_mask) == 0:
-        raise InputError(f"octree masks must be two equal, non-empty vectors, got {node_mask.shape} and {leaf_mask.shape}")
+        raise InputError(
+            f"octree masks must be two equal, non-empty vectors, got {node_mask.shape} and {leaf_mask.shape}"
+        )
     if (node_mask & leaf_mask).any():
         raise InputError("octree: a child is marked both as an interior node and as a leaf")
     n_children = _POPCOUNT[node_mask]

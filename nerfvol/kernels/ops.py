@@ -166,7 +166,9 @@ def _render_reference(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384
             rgb, trans, depth = reference.render(octree, values, ro, rd, torch.tensor(bg), eps)
             part = {"rgb": rgb, "opacity": 1 - trans, "depth": depth}
             if "median_depth" in outputs:
-                part["median_depth"] = reference.median_depth(octree, reference.sample(octree, values, ro, rd, eps), len(rd))
+                part["median_depth"] = reference.median_depth(
+                    octree, reference.sample(octree, values, ro, rd, eps), len(rd)
+                )
             if "normal" in outputs:
                 part["normal"] = reference.normals(octree, values, ro, rd, eps)
             parts.append(part)
@@ -189,9 +191,7 @@ class _Render(torch.autograd.Function):
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
         cotangents = (g.contiguous().numpy() for g in (d_rgb, d_trans, d_depth))
-        native().render_backward(
-            _tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots
-        )
+        native().render_backward(_tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots)
         return gradient, None, None, None, None, None
 
 
@@ -336,10 +336,14 @@ def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOpt
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
         tree = _tree(octree, values.detach().contiguous().numpy())
+        loss = (
+            _check_background(options.background), float(options.early_stop_eps), float(options.colour),
+            float(options.distortion), 1.0,
+        )  # fmt: skip
+        no_optimiser = (None, None, [0.0, 0.0, 0.0], 0.0, 0.0)
+        no_statistics = (None, None, None)
         compiled.train_step(
-            tree, o, d, batch.target, batch.weight, _check_background(options.background),
-            _check_early_stop(options.early_stop_eps), float(options.colour), float(options.distortion), 1.0, gradient.numpy(), None, None, [0.0, 0.0, 0.0], 0.0, 0.0,
-            slots, None, None, None,
+            tree, o, d, batch.target, batch.weight, *loss, gradient.numpy(), *no_optimiser, slots, *no_statistics
         )  # fmt: skip
         return gradient
     leaf = values.detach().clone().requires_grad_()
