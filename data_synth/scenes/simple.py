@@ -89,10 +89,10 @@ def _gem(material: int, centre, radius: float) -> np.ndarray:
     return surfaces.mesh(material, v + np.asarray(centre), f)
 
 
-def fog(density: float = 0.30, g: float = 0.35) -> Scene:
+def fog(density: float = 0.38, g: float = 0.35) -> Scene:
     """fog with shafts of light that fall through a slotted wall onto a checker floor"""
-    medium = media.homogeneous((-2, -2, -1), (2, 2, 1.5), density, 0.97, phase=phase.henyey_greenstein(g))
-    wall = [surfaces.box(1, (1.75, y, -1.0), (1.85, y + 0.62, 1.5)) for y in (-2.0, -1.127, -0.253, 0.62, 1.38)]
+    medium = media.homogeneous((-2, -2, -1), (2, 2, 0.5), density, 0.97, phase=phase.henyey_greenstein(g))
+    wall = [surfaces.box(1, (-1.95, y, -1.0), (-1.85, y + 0.62, 1.65)) for y in (-2.0, -1.127, -0.253, 0.62, 1.38)]
     return Scene(
         medium=medium._replace(step=0.04),
         shapes=[
@@ -103,14 +103,17 @@ def fog(density: float = 0.30, g: float = 0.35) -> Scene:
         ],
         materials=[
             materials.lambert((0.7, 0.68, 0.62), (0.12, 0.13, 0.16), 0.4),
-            materials.lambert((0.25, 0.2, 0.16)),
+            materials.lambert((0.16, 0.13, 0.10)),
             materials.blinn_phong((0.6, 0.06, 0.05), 0.2, 60),
             materials.lambert((0.1, 0.3, 0.5)),
         ],
-        lights=[lights.directional((1.0, -0.12, 0.55), (26.0, 21.0, 14.5)), lights.environment((0.10, 0.13, 0.20))],
+        lights=[
+            lights.directional((-1.0, 0.16, 0.32), (30.0, 24.0, 16.5)),
+            lights.directional((0.5, -0.8, 1.0), (0.5, 0.65, 1.0)),
+        ],
         viewpoints=Viewpoints(target=(0, 0, -0.2), radius=5.8, elevation=(8, 40), fov=42),
         integrators=("march", "path", "deep"),
-        aabb=np.array([[-2.05, -2.05, -1.15], [2.05, 2.05, 1.5]]),
+        aabb=np.array([[-2.05, -2.05, -1.15], [2.05, 2.05, 1.65]]),
     )
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from data_synth import clouds, noise
 from data_synth.errors import InputError
+from data_synth.jit import kernel
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +29,20 @@ def test_textures_tile(textures, name):
             axis=tuple(a for a in range(t.ndim) if a != axis)
         )
         assert steps[-1] <= 1.3 * steps[:-1].max()
+
+
+def test_perlin_repeats_after_one_unit_and_has_no_seam():
+    @kernel
+    def along(out, start):
+        for k in range(len(out)):
+            t = start + k / 200.0
+            out[k] = noise.perlin(t, 0.3 + t, 0.7 - t, 5, 3)
+
+    first, second = np.empty(400), np.empty(200)
+    along(first, 0.0)
+    along(second, 1.0)
+    assert np.allclose(first[200:], second, atol=1e-9) and np.allclose(first[:200], second, atol=1e-9)
+    assert np.abs(np.diff(first)).max() < 0.12  # slope below 24 per unit: continuous over the lattice and the seam
 
 
 def test_curl_noise_has_no_divergence():

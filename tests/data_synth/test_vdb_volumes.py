@@ -9,7 +9,7 @@ import pytest
 
 from data_synth import media
 from data_synth.errors import InputError
-from data_synth.vdb import read_vdb, write_vdb
+from data_synth.vdb import _Reader, _Tree, read_vdb, write_vdb
 from data_synth.volumes import read_volume, write_density
 
 
@@ -50,6 +50,29 @@ def test_random_damage_never_escapes(tmp_path, values):
             read_vdb(tmp_path / "b.vdb")
         except InputError:
             pass
+
+
+@pytest.mark.parametrize(
+    "code, extra, inactive",
+    [
+        (0, b"", (0.5, 0.5)),
+        (1, b"", (-0.5, -0.5)),
+        (2, struct.pack("<f", 3.0), (3.0, 3.0)),
+        (3, bytes([0b1010] + [0] * 63), (0.5, -0.5)),
+        (4, struct.pack("<f", 3.0) + bytes([0b1010] + [0] * 63), (3.0, 0.5)),
+        (5, struct.pack("<ff", 3.0, 4.0) + bytes([0b1010] + [0] * 63), (3.0, 4.0)),
+    ],
+)
+def test_inactive_values_of_a_compressed_leaf(code, extra, inactive):
+    """The six ways in which OpenVDB leaves out inactive values; voxels 1 and 3 are chosen, voxel 2 is active."""
+    data = bytes([code]) + extra + struct.pack("<f", 9.0)
+    tree = _Tree.__new__(_Tree)
+    tree.r, tree.flags, tree.half, tree.background = _Reader(data, "x.vdb"), 2, False, 0.5
+    active = np.zeros(512, bool)
+    active[2] = True
+    values, _ = tree._values(512, active)
+    assert values[:4].tolist() == [inactive[0], inactive[1], 9.0, inactive[1]]
+    assert tree.r.at == len(data)
 
 
 def test_blosc_and_other_formats_are_named(tmp_path, values):
