@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from nerfvol import sh as spherical
 from nerfvol.cameras import Camera
 from nerfvol.datasets import Dataset
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain, RadianceField
+from nerfvol.fields import Domain, RadianceField, SHField
 from nerfvol.kernels import ops
 from nerfvol.merge import merge_smooth
 from nerfvol.metrics import psnr
@@ -114,7 +115,7 @@ def distill(
     frame = Frame.of(domain, config.level)
     level, ijk = candidate_cells(field, frame, config, messages)
     octree = Octree.from_leaves(
-        level, ijk, frame.origin, frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
+        level, ijk, frame.origin.tolist(), frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
     )
     write_values(octree, field, config.samples_per_vertex)
     candidates = octree.n_leaves
@@ -276,9 +277,10 @@ def sh_of(field: RadianceField, degree: int) -> Callable[[Tensor], Tensor]:
     """Function from positions (n, 3) to rows (n, 1 + 3 * basis_dim): coefficient, then SH by channel."""
     dim = spherical.basis_dim(degree)
     if getattr(field, "has_sh", False):
+        with_head = cast(SHField, field)
 
         def from_head(points: Tensor) -> Tensor:
-            sigma, sh = field.sh(points)
+            sigma, sh = with_head.sh(points)
             rows = points.new_zeros(len(points), 3, dim)
             shared = min(dim, sh.shape[-1])
             rows[..., :shared] = sh[..., :shared]

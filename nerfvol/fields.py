@@ -166,7 +166,7 @@ class NeuralField(nn.Module):
     millimetres and the same scene in metres train alike.
     """
 
-    def __init__(self, domain: Domain, shape: FieldShape, encoding: nn.Module) -> None:
+    def __init__(self, domain: Domain, shape: FieldShape, encoding: FrequencyEncoding | HashGrid) -> None:
         super().__init__()
         self.domain, self.shape, self.encoding = domain, shape, encoding
         self.has_sh = shape.head == "sh"

@@ -77,7 +77,7 @@ def _merged(octree: Octree, families: np.ndarray) -> Octree:
     gone[families.reshape(-1)] = True
     level = np.concatenate([octree.leaf_level[~gone], octree.leaf_level[families[:, 0]] - 1])
     ijk = np.concatenate([octree.leaf_ijk[~gone], octree.leaf_ijk[families[:, 0]] >> 1])
-    new = Octree.from_leaves(level, ijk, octree.origin, octree.size, octree.sh_degree, octree.density_scale)
+    new = Octree.from_leaves(level, ijk, octree.origin.tolist(), octree.size, octree.sh_degree, octree.density_scale)
     finest = octree.max_level
 
     def lattice(tree: Octree) -> np.ndarray:

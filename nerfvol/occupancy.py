@@ -123,7 +123,8 @@ class OccupancyGrid:
 
     def cells_at(self, positions: Tensor) -> Tensor:
         """(n, 3) scene positions -> (n,) flat cell index, in the smallest cube that holds each."""
-        return self._indices(*self.domain.scaled(positions).unbind(-1), self.resolution).long()
+        x, y, z = self.domain.scaled(positions).unbind(-1)
+        return self._indices(x, y, z, self.resolution).long()
 
     def update(self, positions: Tensor, sigmas: Tensor) -> None:
         """Note coefficients (n,) seen at (n, 3): a visited cell keeps max(decay * old, largest seen)."""

@@ -49,9 +49,10 @@ def eval_basis(degree: int, dirs: Tensor) -> Tensor:
     values = [torch.full_like(x, Y00)]
     if degree >= 1:
         values += [-_C1 * y, _C1 * z, -_C1 * x]
-    if degree >= 2:
-        xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-        values += [_C2[0] * xy, -_C2[0] * yz, _C2[1] * (2 * zz - xx - yy), -_C2[0] * xz, _C2[2] * (xx - yy)]
+    if degree < 2:
+        return torch.stack(values, dim=-1)
+    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    values += [_C2[0] * xy, -_C2[0] * yz, _C2[1] * (2 * zz - xx - yy), -_C2[0] * xz, _C2[2] * (xx - yy)]
     if degree >= 3:
         values += [
             -_C3[0] * y * (3 * xx - yy),

@@ -252,7 +252,7 @@ class FieldTrainer:
 
     def render(self, rays_o: Tensor, rays_d: Tensor, chunk: int = 4096) -> dict[str, Tensor]:
         """``render_field`` of the field as it is now."""
-        return render_field(self.field, rays_o, rays_d, self.background, self.find_samples, chunk)
+        return render_field(self.field, rays_o, rays_d, self.background.tolist(), self.find_samples, chunk)
 
     def render_camera(self, camera: Camera) -> np.ndarray:
         """(height, width, 3) float32 image of the field as ``camera`` sees it."""

@@ -16,6 +16,7 @@ from nerfvol.distill import (
     candidate_cells,
     dilated,
     distill,
+    largest_sigma,
     largest_weights,
     write_values,
 )
@@ -181,6 +182,18 @@ def test_a_hazy_field_keeps_its_densest_cells() -> None:
     unlimited: list[str] = []
     assert len(candidate_cells(Blob(), frame, DistillConfig(level=5, coarse_level=3), unlimited)[0]) > 3000
     assert not unlimited
+
+
+def test_cells_are_searched_throughout() -> None:
+    """A coefficient that rises along x, y or z: the largest of a cell is that of its last sample on that axis."""
+    corners = np.array([[0.0, 1.0, 2.0], [3.0, -1.0, 0.5]])
+    for axis in range(3):
+
+        class Ramp(Blob):
+            def density(self, positions: torch.Tensor, axis: int = axis) -> torch.Tensor:
+                return positions[:, axis] + 10
+
+        np.testing.assert_allclose(largest_sigma(Ramp(), corners, 0.4, 4), corners[:, axis] + 10 + 0.35, rtol=1e-6)
 
 
 def test_dilation_is_one_cell() -> None:
