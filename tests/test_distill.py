@@ -258,14 +258,17 @@ def test_merging_keeps_within_its_tolerance() -> None:
     assert merge_smooth(octree, 2, 0.0) is octree
 
 
-def test_a_step_is_not_merged() -> None:
+@pytest.mark.parametrize("what", ["density", "red", "view dependence"])
+def test_a_step_is_not_merged(what: str) -> None:
     """One differing vertex in the middle of eight siblings keeps them apart; their parents' neighbours still merge."""
     octree = full_octree(3)
     octree.density = np.full(octree.n_vertices, -3.0)  # an opacity of 0.37 a leaf
     middle = np.argmin(np.abs(octree.vertex_positions() - octree.origin - 0.25).sum(1))
-    raw = octree.density.copy()
-    raw[middle] = -2.9
-    octree.density = raw
+    raw, coefficients = octree.density.copy(), octree.sh
+    raw[middle] += 0.1 * (what == "density")
+    coefficients[middle, 0, 0] += 0.1 * (what == "red")
+    coefficients[middle, 2, 3] += 0.1 * (what == "view dependence")
+    octree.density, octree.sh = raw, coefficients
     merged = merge_smooth(octree, 2, 1e-3)
     assert merged.n_leaves == 63 + 8 and (merged.leaf_level == 3).sum() == 8
     np.testing.assert_array_equal(merged.leaf_ijk[merged.leaf_level == 3].max(0), [1, 1, 1])
