@@ -169,6 +169,17 @@ def test_candidates_cover_what_is_dense_and_little_else() -> None:
     assert not found[distance > radius + (1 + math.sqrt(3)) * 2 / 32 + math.sqrt(3) / 16].any()
 
 
+def test_neighbours_of_what_is_dense_are_candidates() -> None:
+    """A cube of 2 x 2 x 2 leaves: it and the layer around it, in which its surface is interpolated."""
+
+    class Cube(Blob):
+        def density(self, positions: torch.Tensor) -> torch.Tensor:
+            return torch.where((positions - CENTER).abs().max(-1).values < 1 / 16, 50.0, 0.0)
+
+    _, ijk = candidate_cells(Cube(), Frame.of(DOMAIN, 5), DistillConfig(level=5, coarse_level=3), [])
+    assert len(ijk) == 4**3 and ijk.min() == 14 and ijk.max() == 17
+
+
 def test_a_hazy_field_keeps_its_densest_cells() -> None:
     """Too many candidates: the threshold rises until they fit, which is said; the middle of the blob stays."""
     frame, messages = Frame.of(DOMAIN, 5), []
