@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -46,25 +47,48 @@ def srgb_to_linear(image: Float) -> Float:
 def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Float]) -> None:
     """Write float32 ``channels`` to one EXR; "RGB" and "N" are (H, W, 3), the others (H, W), for example "A" and "Z".
 
-    "N" becomes N.X, N.Y, N.Z. Raises InputError where the OpenEXR package is missing.
+    "N" becomes N.X, N.Y, N.Z. Uncompressed scan lines, the plainest kind of file that the OpenEXR format has
+    (openexr.com, "OpenEXR File Layout"): no library is needed for it, and every reader takes it.
     """
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise InputError("writing EXR needs the package OpenEXR (pip install OpenEXR)") from error
-    arrays = {}
+    planes: dict[str, Float] = {}
     for name, array in channels.items():
-        array = np.ascontiguousarray(array, dtype=np.float32)
-        if name == "N":
-            arrays.update({f"N.{axis}": np.ascontiguousarray(array[..., i]) for i, axis in enumerate("XYZ")})
+        if array.ndim == 3:
+            suffixes = ("R", "G", "B") if name == "RGB" else tuple(f"{name}.{axis}" for axis in "XYZ")
+            planes.update({suffix: array[..., i] for i, suffix in enumerate(suffixes)})
         else:
-            arrays[name] = array
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with atomic_write(path) as temporary:
-        try:
-            OpenEXR.File(header, arrays).write(str(temporary))
-        except RuntimeError as error:  # the library's only word for a full disk
-            raise OSError(None, str(error).splitlines()[0], str(temporary)) from error
+            planes[name] = array
+    names = sorted(planes)  # the format wants channels in this order
+    rows = np.stack([planes[name] for name in names], axis=1).astype("<f4")  # (H, channel, W), as they lie in the file
+    header = _exr_header(names, width=rows.shape[2], height=rows.shape[0])
+    row_bytes = rows[0].nbytes
+    first = len(header) + 8 * len(rows)
+    offsets = first + (8 + row_bytes) * np.arange(len(rows), dtype="<u8")
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(header + offsets.tobytes())
+        for number, row in enumerate(rows):
+            file.write(struct.pack("<ii", number, row_bytes) + row.tobytes())
+
+
+def _exr_header(names: list[str], width: int, height: int) -> bytes:
+    """Magic number, version 2 and the eight attributes that every EXR must have."""
+    full_float, all_pixels = 2, (1, 1)
+    listed = b"".join(name.encode() + struct.pack("<xiB3xii", full_float, 0, *all_pixels) for name in names) + b"\0"
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    attributes = [
+        ("channels", "chlist", listed),
+        ("compression", "compression", b"\0"),  # none
+        ("dataWindow", "box2i", window),
+        ("displayWindow", "box2i", window),
+        ("lineOrder", "lineOrder", b"\0"),  # top to bottom
+        ("pixelAspectRatio", "float", struct.pack("<f", 1.0)),
+        ("screenWindowCenter", "v2f", struct.pack("<2f", 0.0, 0.0)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1.0)),
+    ]
+    packed = [
+        name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
+        for name, kind, value in attributes
+    ]
+    return struct.pack("<ii", 20000630, 2) + b"".join(packed) + b"\0"
 
 
 class VideoWriter:
