@@ -290,6 +290,13 @@ class TrainState:
         self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
 
 
+def _check_batch(batch: Batch, options: LossOptions) -> tuple[np.ndarray, np.ndarray, list[float], float]:
+    o, d = _check_rays(batch.rays_o, batch.rays_d)
+    if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
+        raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")
+    return o, d, _check_background(options.background), _check_early_stop(options.early_stop_eps)
+
+
 def train_step(
     octree: Octree, state: TrainState, batch: Batch, options: LossOptions, rates: Rates, pixel_angle: float
 ) -> StepReport:
@@ -297,11 +304,8 @@ def train_step(
 
     Bitwise the same for any number of threads.
     """
-    o, d = _check_rays(batch.rays_o, batch.rays_d)
-    bg, eps = _check_background(options.background), _check_early_stop(options.early_stop_eps)
+    o, d, bg, eps = _check_batch(batch, options)
     state.check(octree)
-    if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
-        raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")
     if (compiled := native()) is None:
         return _train_step_reference(octree, state, batch, options, rates, pixel_angle)
     squared, weight, samples = compiled.train_step(
@@ -331,20 +335,17 @@ def train_step(
 
 def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOptions) -> Tensor:
     """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled."""
+    o, d, bg, eps = _check_batch(batch, options)
     if values.dtype == torch.float32 and (compiled := native()) is not None:
-        o, d = _check_rays(batch.rays_o, batch.rays_d)
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
         tree = _tree(octree, values.detach().contiguous().numpy())
-        loss = (
-            _check_background(options.background), float(options.early_stop_eps), float(options.colour),
-            float(options.distortion), 1.0,
-        )  # fmt: skip
+        loss = (bg, eps, float(options.colour), float(options.distortion), 1.0)
         no_optimiser = (None, None, [0.0, 0.0, 0.0], 0.0, 0.0)
         no_statistics = (None, None, None)
         compiled.train_step(
             tree, o, d, batch.target, batch.weight, *loss, gradient.numpy(), *no_optimiser, slots, *no_statistics
-        )  # fmt: skip
+        )
         return gradient
     leaf = values.detach().clone().requires_grad_()
     total, _ = _reference_loss(octree, leaf, batch, options)
