@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test clean
+.PHONY: demo test sanitize clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -15,6 +15,11 @@ demo: $(BIN)/python
 test: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python -m pytest -q
+
+# The kernels' tests on a build with address and undefined-behaviour sanitizers.
+sanitize: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]' cmake ninja nanobind
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tests/kernels/sanitize.py
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

@@ -205,3 +205,11 @@ def test_the_environment_chooses_the_build():
     code = "from nerfvol.kernels import ops; print(ops.isa())"
     assert run(code, NERFVOL_ISA="baseline").stdout.strip() == "baseline"
     assert "not available" in run(code, NERFVOL_ISA="sse9").stderr
+
+
+@pytest.mark.skipif("NERFVOL_EXPECT_KERNELS" not in os.environ, reason="only in a sanitizer run")
+def test_a_sanitizer_run_tests_the_build_that_it_made():
+    path = native_module.native().__file__
+    assert path.startswith(os.environ["NERFVOL_EXPECT_KERNELS"])
+    with open("/proc/self/maps") as maps:
+        assert "asan" in maps.read()
