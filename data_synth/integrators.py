@@ -29,7 +29,7 @@ from data_synth.scene import Scene
 class March:
     """Ray-marched single scattering. beams: rays that stand for a sky or area light; side: side^2 rays per pixel."""
 
-    beams: int = 24
+    beams: int = 12
     side: int = 1
     mode: int = field(default=march.MARCHED, repr=False)
 

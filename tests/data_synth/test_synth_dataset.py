@@ -119,7 +119,7 @@ def test_exr_round_trip(tmp_path):
 
 
 def test_dataset_has_the_nerf_synthetic_layout(tmp_path):
-    scene = scenes.make("sphere")
+    scene = scenes.make("slab")  # not symmetric about an axis: other cameras make other pictures
     write_dataset(scene, tmp_path / "out", Options(views=3, size=(12, 10), seed=4, exr=True))
     for split, n in (("train", 3), ("val", 1), ("test", 2)):
         meta = json.loads((tmp_path / "out" / f"transforms_{split}.json").read_text())
@@ -133,7 +133,7 @@ def test_dataset_has_the_nerf_synthetic_layout(tmp_path):
             assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
     assert meta["camera_angle_x"] == pytest.approx(np.radians(scene.viewpoints.fov))
     provenance = json.loads((tmp_path / "out" / "provenance.json").read_text())
-    assert provenance["scene"] == "sphere" and provenance["seed"] == 4
+    assert provenance["scene"] == "slab" and provenance["seed"] == 4
     # the same seed makes the same bytes
     write_dataset(scene, tmp_path / "again", Options(views=3, size=(12, 10), seed=4))
     for png in sorted((tmp_path / "out").rglob("*.png")):
