@@ -94,7 +94,7 @@ def fog(density: float = 0.38, g: float = 0.35) -> Scene:
     medium = media.homogeneous((-2, -2, -1), (2, 2, 0.5), density, 0.97, phase=phase.henyey_greenstein(g))
     wall = [surfaces.box(1, (-1.95, y, -1.0), (-1.85, y + 0.62, 1.65)) for y in (-2.0, -1.127, -0.253, 0.62, 1.38)]
     return Scene(
-        medium=medium._replace(step=0.04),
+        medium=medium._replace(step=0.015),
         shapes=[
             surfaces.box(0, (-2, -2, -1.1), (2, 2, -1.0)),
             surfaces.sphere(2, (-0.5, -0.3, -0.55), 0.45),
