@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from conftest import make_sphere_octree
+from tiny import make_sphere_octree
 
 from nerfvol import bench
 from nerfvol.camera_paths import default_orbit, orbit_cameras

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import make_sphere_octree, write_scene
+from tiny import make_sphere_octree, write_scene
 
 import nerfvol
 from nerfvol import cli, runs

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import make_sphere_octree
+from tiny import make_sphere_octree
 
 from nerfvol.datasets import load_dataset
 from nerfvol.evaluate import LARGEST_PSNR, evaluate_octree, score_views

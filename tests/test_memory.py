@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from conftest import make_sphere_octree
+from tiny import make_sphere_octree
 
 from nerfvol import memory
 from nerfvol.datasets import load_dataset

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import write_scene
+from tiny import write_scene
 
 import nerfvol
 from nerfvol import cli, runs, session, trainer
