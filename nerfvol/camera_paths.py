@@ -33,7 +33,7 @@ def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = No
         InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
     """
     # The dialects' one reader of intrinsics; its own read_cameras insists on images and focal lengths.
-    from nerfvol.datasets.blender import _calibration, _matrix
+    from nerfvol.datasets.blender import read_calibration, read_matrix
 
     document = read_json(path)
     frames = document.get("frames") if isinstance(document, dict) else None
@@ -45,7 +45,7 @@ def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = No
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise InputError(f"{path}, frame {index}: expected an object with a transform_matrix")
         try:
-            camera = _camera(_calibration({**shared, **frame}), _matrix(frame["transform_matrix"]), size)
+            camera = _camera(read_calibration({**shared, **frame}), read_matrix(frame["transform_matrix"]), size)
         except InputError as error:
             raise InputError(f"{path}, frame {index}: {error}") from error
         cameras.append(camera)

@@ -117,8 +117,8 @@ def _parse(data: Mapping[str, Any], path: Path) -> tuple[list[Frame], BoundsHint
         if "transform_matrix" not in entry:
             raise InputError(f"{where}: transform_matrix is missing")
         try:
-            c2w = rigid_pose(_matrix(entry["transform_matrix"]))
-            calibration = _calibration({**shared, **entry})
+            c2w = rigid_pose(read_matrix(entry["transform_matrix"]))
+            calibration = read_calibration({**shared, **entry})
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
         frames.append(Frame(listed, finder.find(listed), c2w, calibration))
@@ -128,7 +128,7 @@ def _parse(data: Mapping[str, Any], path: Path) -> tuple[list[Frame], BoundsHint
         raise InputError(f"{path}: {error}") from None
 
 
-def _matrix(value: Any) -> np.ndarray:
+def read_matrix(value: Any) -> np.ndarray:
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -147,7 +147,7 @@ def _number(data: Mapping[str, Any], *keys: str) -> float | None:
     return None
 
 
-def _calibration(data: Mapping[str, Any]) -> Calibration:
+def read_calibration(data: Mapping[str, Any]) -> Calibration:
     model = data.get("camera_model", "OPENCV")
     if model not in _PINHOLE_MODELS + _FISHEYE_MODELS:
         known = ", ".join(_PINHOLE_MODELS + _FISHEYE_MODELS)
