@@ -37,7 +37,7 @@ class OctreeConfig:
     prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 2, 2, 2])
     """Prunings inside each stage, evenly spaced."""
     coverage: float = 0.5
-    """Pruning waits until this share of the tiles that are not plain background was seen (at most 20000 tiles)."""
+    """Pruning waits until this share of the tiles that are not plain background was seen (see _seen_enough for the cap)."""
     sh_degree: int = 1
     rich_share: float = 0.8
     """Share of a batch drawn from tiles that are not plain background."""
@@ -181,8 +181,9 @@ class OctreeTrainer:
 
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
-        c = self.config
-        return self.bank is not None and self.tiles_seen >= min(c.coverage * len(self.bank.rich_tiles), 20000)
+        # Around photographs much is seen at the rim of a few of them only: it takes more tiles to have met it at all.
+        enough = 20_000 if self.dataset.scene.background_cube is None else 80_000
+        return self.bank is not None and self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
 
     def _prune_inside_stage(self, progress: float) -> None:
         c = self.config

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.helpers.statistics import assert_histogram, assert_means, assert_sample_mean, sidak
+from tests.helpers.hypothesis_tests import assert_histogram, assert_means, assert_sample_mean, sidak
 
 
 def test_sidak_is_the_joint_level():
