@@ -63,7 +63,7 @@ class OctreeConfig:
     """... and only the fewest leaves that hold this share of the squared error."""
     choosy_from: int = 9
     fine_steps: int = 1500
-    """A stage from level ``choosy_from`` on is left out where fewer steps would be left for it: it would only blur."""
+    """A stage from level ``choosy_from`` on is left out where fewer steps would be left for it."""
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""
 
