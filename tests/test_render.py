@@ -30,12 +30,14 @@ def camera_at(width, height, **lens):
 
 # ---------------------------------------------------------------- pixels
 @pytest.mark.parametrize("size", [(37, 21), (40, 16), (8, 8), (1, 1), (5, 70)])
-@pytest.mark.parametrize("band", [64, 1 << 20])
-def test_every_pixel_is_its_own_ray(sphere_octree, monkeypatch, size, band):
-    """Against one ray per pixel in row order: tiles, bands and cropping move nothing."""
-    monkeypatch.setattr(render, "BAND_RAYS", band)
+@pytest.mark.parametrize("path", ["compiled", "reference"])
+def test_every_pixel_is_its_own_ray(sphere_octree, monkeypatch, size, path):
+    """Against one ray per pixel in row order: tiles and cropping move nothing."""
     camera = camera_at(*size)
-    image = render.render_image(sphere_octree, camera, (0.2, 0.4, 0.6), 0.0)
+    with monkeypatch.context() as patch:
+        if path == "reference":
+            patch.setattr(ops, "native", lambda: None)
+        image = render.render_image(sphere_octree, camera, (0.2, 0.4, 0.6), 0.0)
     origin, directions = camera.rays()
     expected = ops.render_rays(
         sphere_octree, np.broadcast_to(origin, directions.shape).copy(), directions, (0.2, 0.4, 0.6), 0.0

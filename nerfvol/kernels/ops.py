@@ -131,30 +131,72 @@ def render_rays(
     by less than that; 0 is exact.
     """
     o, d = _check_rays(rays_o, rays_d)
-    bg, early_stop_eps = _check_background(background), _check_early_stop(early_stop_eps)
-    unknown = set(outputs) - set(OUTPUTS)
-    if unknown:
-        raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
-    n = len(d)
+    bg, eps = _check_background(background), _check_early_stop(early_stop_eps)
+    _check_outputs(outputs)
     if (compiled := native()) is None:
-        return _render_reference(octree, o, d, bg, early_stop_eps, outputs)
-    out = {k: np.empty((n, 3) if k in ("rgb", "normal") else n, np.float32) for k in OUTPUTS if k in outputs}
-    values = np.ascontiguousarray(octree.values, dtype=np.float32)
-    compiled.render(
-        _tree(octree, values),
-        o,
-        d,
-        bg,
-        float(early_stop_eps),
-        out.get("rgb"),
-        out.get("opacity"),
-        out.get("depth"),
-        out.get("median_depth"),
-        out.get("normal"),
-    )
+        return _render_reference(octree, o, d, bg, eps, outputs)
+    out = _empty_outputs(outputs, (len(d),))
+    tree = _tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
+    compiled.render(tree, o, d, bg, eps, *(out.get(name) for name in OUTPUTS))
+    return _finished(out)
+
+
+def render_view(
+    octree: Octree,
+    directions: np.ndarray,
+    camera_to_world: np.ndarray,
+    size: tuple[int, int],
+    background: Sequence[float] = WHITE,
+    early_stop_eps: float = DEFAULT_EARLY_STOP,
+    outputs: Sequence[str] = OUTPUTS,
+) -> dict[str, Tensor]:
+    """Renders a camera's picture of ``size`` (height, width); results as in :func:`render_rays`, (height, width[, 3]).
+
+    directions: (tile rows, tile columns, 64, 3) float32 unit directions in camera axes, one row of 64 for each 8x8 tile;
+    tiles at the right and lower edge may reach beyond the picture. camera_to_world: (4, 4), or (3, 4).
+    """
+    height, width = size
+    tiles = (-(-height // 8), -(-width // 8), TILE, 3)
+    if directions.shape != tiles or directions.dtype != np.float32 or not directions.flags.c_contiguous:
+        raise ValueError(f"directions must be float32 {tiles}, got {directions.dtype} {directions.shape}")
+    rotation, origin = np.asarray(camera_to_world)[:3, :3], np.asarray(camera_to_world, np.float32)[:3, 3]
+    if not np.isfinite(camera_to_world).all():
+        raise ValueError("camera_to_world must be finite")
+    bg, eps = _check_background(background), _check_early_stop(early_stop_eps)
+    _check_outputs(outputs)
+    if (compiled := native()) is None:
+        flat = directions.reshape(-1, 3) @ rotation.T.astype(np.float32)
+        origins = np.broadcast_to(origin, (len(flat) // TILE, 3)).copy()
+        rays = _render_reference(octree, origins, flat, bg, eps, outputs)
+        return {name: _from_tiles(rows, tiles[0], tiles[1])[:height, :width] for name, rows in rays.items()}
+    out = _empty_outputs(outputs, (height, width))
+    tree = _tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
+    frame = (rotation.ravel().tolist(), origin.tolist(), height, width)
+    compiled.render_view(tree, directions, *frame, bg, eps, *(out.get(name) for name in OUTPUTS))
+    return _finished(out)
+
+
+def _check_outputs(outputs: Sequence[str]) -> None:
+    if unknown := set(outputs) - set(OUTPUTS):
+        raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
+
+
+def _empty_outputs(outputs: Sequence[str], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Arrays for the kernels to fill; they write the transmittance where the opacity is wanted."""
+    vectors = ("rgb", "normal")
+    return {k: np.empty((*shape, 3) if k in vectors else shape, np.float32) for k in OUTPUTS if k in outputs}
+
+
+def _finished(out: dict[str, np.ndarray]) -> dict[str, Tensor]:
     if "opacity" in out:
         np.subtract(1, out["opacity"], out=out["opacity"])
     return {k: torch.from_numpy(v) for k, v in out.items()}
+
+
+def _from_tiles(rows: Tensor, down: int, across: int) -> Tensor:
+    """(down * across * 64, ...) in tiles as a picture (8 down, 8 across, ...)."""
+    tiles = rows.reshape(down, across, 8, 8, *rows.shape[1:])
+    return tiles.transpose(1, 2).reshape(8 * down, 8 * across, *rows.shape[1:])
 
 
 def _render_reference(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -> dict[str, Tensor]:

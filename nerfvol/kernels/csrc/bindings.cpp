@@ -81,6 +81,27 @@ void py_render(const TreeArrays& t, Rows origins, Rows directions, std::vector<f
     kernels().render(t.tree, rays, options, out);
 }
 
+// Directions of a camera's rays (tile rows, tile columns, 64, 3); outputs are pictures (height, width[, 3]).
+void py_render_view(const TreeArrays& t, In<float, nb::shape<-1, -1, 64, 3>> directions, std::vector<float> rotation,
+                    std::vector<float> origin, int64_t height, int64_t width, std::vector<float> background, float eps,
+                    Maybe<Out<float, nb::ndim<3>>> rgb, Maybe<FloatRows> trans, Maybe<FloatRows> depth, Maybe<FloatRows> median,
+                    Maybe<Out<float, nb::ndim<3>>> normal) {
+    View view{directions.data(), int64_t(directions.shape(0)), int64_t(directions.shape(1)), height, width, {}, {}};
+    if (view.tile_rows * 8 < height || view.tile_columns * 8 < width || height <= view.tile_rows * 8 - 8 || width <= view.tile_columns * 8 - 8)
+        throw std::invalid_argument("the directions do not cover the picture in 8x8 tiles");
+    for (int k = 0; k < 9; ++k) view.rotation[k] = rotation.at(size_t(k));
+    for (int k = 0; k < 3; ++k) view.origin[k] = origin.at(size_t(k));
+    const auto check = [&](const auto& a) {
+        if (a && (int64_t(a->shape(0)) != height || int64_t(a->shape(1)) != width))
+            throw std::invalid_argument("an output does not have the picture's size");
+    };
+    check(rgb); check(trans); check(depth); check(median); check(normal);
+    const RenderOptions options = make_options(background, eps);
+    const RenderOutput out{pointer(rgb), pointer(trans), pointer(depth), pointer(median), pointer(normal)};
+    nb::gil_scoped_release release;
+    kernels().render_view(t.tree, view, options, out);
+}
+
 void py_render_backward(const TreeArrays& t, Rows origins, Rows directions, std::vector<float> background, float eps,
                         Maybe<Rows> rgb, Maybe<In<float, nb::ndim<1>>> trans, Maybe<In<float, nb::ndim<1>>> depth,
                         FloatRows gradient, Out<int32_t, nb::ndim<1>> slots) {
@@ -147,6 +168,9 @@ NB_MODULE(_nerfvol_kernels, m) {
         "density_scale"_a);
     m.def("render", &py_render, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(),
           "trans"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none());
+    m.def("render_view", &py_render_view, "tree"_a, "directions"_a, "rotation"_a, "origin"_a, "height"_a, "width"_a,
+          "background"_a, "early_stop_eps"_a, "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "median_depth"_a.none(),
+          "normal"_a.none());
     m.def("render_backward", &py_render_backward, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a,
           "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "gradient"_a, "slots"_a);
     m.def("train_step", &py_train_step, "tree"_a, "rays_o"_a, "rays_d"_a, "target"_a, "weight"_a, "background"_a,

@@ -52,36 +52,33 @@ struct Extinction {
     }
 };
 
-// The segments of one ray packet, delivered leaf by leaf with a little look-ahead so that memory can arrive in time.
-template <int B, class Sink> void march(const Tree& tree, Packet& p, const BasisRows<B>& basis, Sink&& sink) {
-    constexpr int kAhead = 4;
+// The segments of one ray packet, delivered leaf by leaf. Leaves wait in a queue while their memory arrives: the walk asks
+// for a leaf's corners, kRows leaves later the corners are read and their rows asked for, kAhead leaves later it is used.
+template <int B, class Sink> void march(const Tree& tree, Packet& p, Sink&& sink) {
+    constexpr uint32_t kAhead = 16, kRows = 8;
     Walk walk(tree, p);
     Leaf queue[kAhead];
-    int head = 0, waiting = 0;
+    uint32_t found = 0, asked = 0, used = 0;
+    const auto ask = [&] {
+        const int32_t* c = tree.corners + 8 * int64_t(queue[asked++ % kAhead].index);
+        for (int o = 0; o < 8; ++o)
+            for (int k = 0; k < B; ++k) __builtin_prefetch(tree.values + 16 * (B * int64_t(c[o]) + k));
+    };
     Segments segments;
-    bool more = true;
     for (;;) {
-        while (more && waiting < kAhead) {
-            Leaf& leaf = queue[(head + waiting) % kAhead];
-            more = walk.next(leaf);
-            if (!more) break;
-            const int32_t* c = tree.corners + 8 * int64_t(leaf.index);
-            for (int o = 0; o < 8; ++o)
-                for (int k = 0; k < B; ++k) __builtin_prefetch(tree.values + 16 * (B * int64_t(c[o]) + k));
-            ++waiting;
+        while (found - used < kAhead && walk.next(queue[found % kAhead])) {
+            ++found;
+            if (found - asked > kRows) ask();
         }
-        if (!waiting) return;
-        Leaf& leaf = queue[head];
-        head = (head + 1) % kAhead;
-        --waiting;
+        if (found == used) return;
+        if (found - used < kAhead)
+            while (asked != found) ask();
+        Leaf& leaf = queue[used++ % kAhead];
         leaf.rays &= p.alive;
         if (!leaf.rays) continue;
         const uint64_t hits = intersect(p, leaf, segments);
         if (!hits) continue;
-        const int32_t* c = tree.corners + 8 * int64_t(leaf.index);
-        const float* rows[8];
-        for (int o = 0; o < 8; ++o) rows[o] = tree.values + 16 * B * int64_t(c[o]);
-        sink(leaf, hits, segments, rows, basis);
+        sink(leaf, hits, segments, LeafField<B>(tree.values, tree.corners + 8 * int64_t(leaf.index)));
     }
 }
 

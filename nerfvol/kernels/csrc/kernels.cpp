@@ -4,5 +4,5 @@
 
 namespace NERFVOL_ISA {
 extern const nerfvol::Kernels table;
-const nerfvol::Kernels table = {render, backward};
+const nerfvol::Kernels table = {render, render_view, backward};
 }  // namespace NERFVOL_ISA

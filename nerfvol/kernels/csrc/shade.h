@@ -30,10 +30,8 @@ inline void sh_basis(int degree, float x, float y, float z, float* b) {
     b[15] = -0.5900435899266435f * x * (x * x - 3 * y * y);
 }
 
-// Where coefficient k of channel c stands in a vertex row (nerfvol/octree.py has the same rule). Slot 12 is raw density.
-inline int sh_slot(int degree, int c, int k) {
-    return degree == 2 && k == 8 ? 28 + c : 16 * (k / 4) + 4 * c + k % 4;
-}
+// Slot of the raw density in a vertex row. Coefficient k of channel c stands at 16 (k / 4) + 4 c + k % 4, save that degree 2's
+// ninth coefficients stand at 28 + c (nerfvol/octree.py has the same rule).
 constexpr int kDensitySlot = 12;
 
 // Per ray: the basis in the places of a vertex row, with 1 at the raw density.
@@ -41,15 +39,20 @@ template <int B> struct BasisRows {
     alignas(64) float row[kTile][16 * B];
 
     void fill(const Packet& p, int degree) {
-        std::memset(row, 0, sizeof(row));
-        const int n = (degree + 1) * (degree + 1);
         for (int l = 0; l < kTile; ++l) {
             if (!(p.alive >> l & 1)) continue;
-            float b[16];
+            float b[16] = {};
             sh_basis(degree, p.dx[l], p.dy[l], p.dz[l], b);
-            for (int c = 0; c < 3; ++c)
-                for (int k = 0; k < n; ++k) row[l][sh_slot(degree, c, k)] = b[k];
-            row[l][kDensitySlot] = 1.0f;
+            for (int k = 0; k < B; ++k) {
+                const f4 four = load<f4>(b + 4 * k);
+                f4 last{};
+                if (k == 0) last[0] = 1.0f;
+                else if (B == 2) last = f4{b[8], b[8], b[8], 0.0f};
+                store(row[l] + 16 * k, four);
+                store(row[l] + 16 * k + 4, four);
+                store(row[l] + 16 * k + 8, four);
+                store(row[l] + 16 * k + 12, last);
+            }
         }
     }
 };
@@ -62,29 +65,51 @@ inline f8 trilinear(float fx, float fy, float fz) {
     return (sx * fx + ax) * (sy * fy + ay) * (sz * fz + az);
 }
 
-// (r, g, b, raw density) at a point: rgb without the constant 1/2.
-template <int B> inline f4 evaluate(const float* const* rows, f8 weights, const float* basis) {
-    alignas(32) float w[8];
-    store(w, weights);
-    keep_in_memory(w);
-    f4 out{};
-    for (int k = 0; k < B; ++k) {
-        f16 sum = w[0] * load<f16>(rows[0] + 16 * k), other = w[4] * load<f16>(rows[4] + 16 * k);
-        for (int o = 1; o < 4; ++o) {  // two chains: half the latency
-            sum += w[o] * load<f16>(rows[o] + 16 * k);
-            other += w[o + 4] * load<f16>(rows[o + 4] + 16 * k);
-        }
-        sum = (sum + other) * load<f16>(basis + 16 * k);
-        const f16 q = quad_sums(sum);
-        f4 rgb = __builtin_shufflevector(q, q, 0, 4, 8, 12);
-        if (k > 0) {
-            rgb[3] = 0;  // only the first block holds a density
-            if (B == 2) rgb += __builtin_shufflevector(sum, splat16(0.0f), 12, 13, 14, 16);  // degree 2's ninth coefficient
-        }
-        out += rgb;
+// The field of a leaf as a polynomial in the place (x, y, z) inside it: coefficient o multiplies x^(o>>2&1) y^(o>>1&1)
+// z^(o&1). Made once for all rays that meet the leaf; a point then costs seven multiply-adds and three broadcasts.
+template <int B> struct LeafField {
+    f16 c[8][B];
+
+    LeafField(const float* values, const int32_t* corners) {
+        for (int o = 0; o < 8; ++o)
+            for (int k = 0; k < B; ++k) c[o][k] = load<f16>(values + 16 * (B * int64_t(corners[o]) + k));
+        for (int axis = 1; axis < 8; axis *= 2)
+            for (int o = 0; o < 8; ++o)
+                if (o & axis)
+                    for (int k = 0; k < B; ++k) c[o][k] -= c[o ^ axis][k];
     }
-    return out;
-}
+
+    f16 row(int k, float x, float y, float z) const {
+        const f16 front = (c[0][k] + z * c[1][k]) + y * (c[2][k] + z * c[3][k]);
+        const f16 back = (c[4][k] + z * c[5][k]) + y * (c[6][k] + z * c[7][k]);
+        return front + x * back;
+    }
+
+    // (r, g, b, raw density) at a point along a ray's basis: rgb without the constant 1/2.
+    f4 at(float x, float y, float z, const float* basis) const {
+        f4 out{};
+        for (int k = 0; k < B; ++k) {
+            const f16 terms = row(k, x, y, z) * load<f16>(basis + 16 * k);
+            const f16 q = quad_sums(terms);
+            f4 rgb = __builtin_shufflevector(q, q, 0, 4, 8, 12);
+            if (k > 0) {
+                rgb[3] = 0;  // only the first block holds a density
+                if (B == 2) rgb += __builtin_shufflevector(terms, splat16(0.0f), 12, 13, 14, 16);  // degree 2's ninth coefficient
+            }
+            out += rgb;
+        }
+        return out;
+    }
+
+    // d(raw density)/d(x, y, z) at a point.
+    void density_slope(float x, float y, float z, float* g) const {
+        float d[8];
+        for (int o = 0; o < 8; ++o) d[o] = c[o][0][kDensitySlot];
+        g[0] = d[4] + z * d[5] + y * (d[6] + z * d[7]);
+        g[1] = d[2] + z * d[3] + x * (d[6] + z * d[7]);
+        g[2] = d[1] + y * d[3] + x * (d[5] + y * d[7]);
+    }
+};
 
 // sigma / density_scale: exponential below 1, linear above (value and slope are continuous).
 inline f16 explin(f16 raw) { return raw < 1.0f ? exp16(raw - 1.0f) : raw; }

@@ -12,6 +12,8 @@ typedef float f8 __attribute__((vector_size(32)));
 typedef int32_t i8v __attribute__((vector_size(32)));
 typedef float f16 __attribute__((vector_size(64)));
 typedef int32_t i16v __attribute__((vector_size(64)));
+typedef int64_t l8 __attribute__((vector_size(64)));
+typedef uint64_t u8l __attribute__((vector_size(64)));
 
 inline f8 splat8(float x) { return f8{x, x, x, x, x, x, x, x}; }
 inline f16 splat16(float x) { return f16{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
@@ -22,8 +24,21 @@ template <class V> inline void store(void* p, const V& v) { std::memcpy(p, &v, s
 // Keeps eight numbers in memory: broadcasting from there is one load, from a register several shuffles.
 inline void keep_in_memory(float (&w)[8]) { __asm__("" : "+m"(w)); }
 
-template <class V> inline V vmin(V a, V b) { return a < b ? a : b; }
-template <class V> inline V vmax(V a, V b) { return a > b ? a : b; }
+// a < b ? a : b and a > b ? a : b; compilers do not see the one instruction in that. (GCC warns of the unmasked forms.)
+#if defined(__AVX512F__)
+inline f16 vmin(f16 a, f16 b) { return (f16)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b); }
+inline f16 vmax(f16 a, f16 b) { return (f16)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b); }
+#else
+inline f16 vmin(f16 a, f16 b) { return a < b ? a : b; }
+inline f16 vmax(f16 a, f16 b) { return a > b ? a : b; }
+#endif
+#if defined(__AVX__)
+inline f8 vmin(f8 a, f8 b) { return (f8)_mm256_min_ps((__m256)a, (__m256)b); }
+inline f8 vmax(f8 a, f8 b) { return (f8)_mm256_max_ps((__m256)a, (__m256)b); }
+#else
+inline f8 vmin(f8 a, f8 b) { return a < b ? a : b; }
+inline f8 vmax(f8 a, f8 b) { return a > b ? a : b; }
+#endif
 
 // One bit per lane of a comparison's result.
 inline uint32_t mask_bits(i8v m) {

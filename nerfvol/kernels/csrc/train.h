@@ -82,7 +82,7 @@ void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, floa
     work.visits.clear();
     work.first_hit.clear();
     start(state);
-    march<B>(tree, p, basis, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const float* const* rows, const BasisRows<B>& b) {
+    march<B>(tree, p, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const LeafField<B>& field) {
         const int m = __builtin_popcountll(hits);
         const size_t base = work.size;
         Hit* h = work.append(size_t(m));
@@ -93,7 +93,7 @@ void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, floa
             h[i].fx = s.fx[l]; h[i].fy = s.fy[l]; h[i].fz = s.fz[l];
             h[i].length = s.length[l] * tree.size;
             h[i].middle = s.middle[l];
-            h[i].value = evaluate<B>(rows, trilinear(s.fx[l], s.fy[l], s.fz[l]), b.row[l]);
+            h[i].value = field.at(s.fx[l], s.fy[l], s.fz[l], basis.row[l]);
             x.raw[i] = h[i].value[3];
             x.length[i] = h[i].length;
         }

@@ -22,8 +22,8 @@ struct Packet {
     uint64_t alive;                                        // rays still to be continued
     bool bounded;                                          // the pyramid below holds
     float axis[3], u[3], v[3];                             // the pyramid's frame
-    alignas(32) float col_min[8], col_max[8], row_min[8], row_max[8];  // slopes along u of columns, along v of rows
-    float u_min, u_max, v_min, v_max;
+    float u_min, u_max, v_min, v_max;                      // slopes of all rays along u and v
+    struct Grid { float low, high, per_step; } columns, rows;  // see bound_grid
 };
 
 // A leaf on the packet's way: its smallest corner, its side and the rays that may meet it.
@@ -47,6 +47,26 @@ inline void normalize3(float* a) {
 inline void set_direction(Packet& p, int lane, const float* d) {
     p.dx[lane] = d[0]; p.dy[lane] = d[1]; p.dz[lane] = d[2];
     p.ix[lane] = reciprocal(d[0]); p.iy[lane] = reciprocal(d[1]); p.iz[lane] = reciprocal(d[2]);
+}
+
+// The slopes of eight columns (or rows) of rays as an even grid: column k has slopes inside k / per_step + [high, low],
+// high <= low, so that those at or above a slope s are k >= (s - low) * per_step, those below it k <= (s - high) * per_step,
+// and no ray is missed however uneven the columns are.
+inline Packet::Grid even_grid(const float* lowest, const float* highest) {
+    int first = -1, last = -1;
+    for (int k = 0; k < 8; ++k)
+        if (lowest[k] <= highest[k]) { last = k; if (first < 0) first = k; }
+    const float from = lowest[first] + highest[first], to = lowest[last] + highest[last];
+    const float step = std::fmax(last > first ? 0.5f * (to - from) / float(last - first) : 0.0f, 1e-7f);
+    Packet::Grid g = {-1e30f, 1e30f, 1.0f / step};
+    for (int k = first; k <= last; ++k)
+        if (lowest[k] <= highest[k]) {
+            g.low = std::fmax(g.low, highest[k] - k * step);
+            g.high = std::fmin(g.high, lowest[k] - k * step);
+        }
+    g.low += 1e-3f * step + 1e-7f;
+    g.high -= 1e-3f * step + 1e-7f;
+    return g;
 }
 
 // Computes the pyramid around the rays in `alive`. Lanes are thought of as 8 rows of 8; any arrangement is correct, an
@@ -75,28 +95,41 @@ inline void bound_packet(Packet& p) {
     normalize3(across);
     const float down[3] = {axis[1] * across[2] - axis[2] * across[1], axis[2] * across[0] - axis[0] * across[2],
                            axis[0] * across[1] - axis[1] * across[0]};
-    for (int k = 0; k < 8; ++k) { p.col_min[k] = p.row_min[k] = 1e30f; p.col_max[k] = p.row_max[k] = -1e30f; }
-    for (int l = 0; l < kTile; ++l) {
-        if (!(p.alive >> l & 1)) continue;
-        const float d[3] = {p.dx[l], p.dy[l], p.dz[l]};
-        const float depth = dot3(d, axis);
-        if (depth < 0.3f) return;
-        const float su = dot3(d, across) / depth, sv = dot3(d, down) / depth;
-        const int c = l % 8, r = l / 8;
-        p.col_min[c] = std::fmin(p.col_min[c], su); p.col_max[c] = std::fmax(p.col_max[c], su);
-        p.row_min[r] = std::fmin(p.row_min[r], sv); p.row_max[r] = std::fmax(p.row_max[r], sv);
+    f8 col_min = splat8(1e30f), col_max = -col_min;
+    float row_min[8], row_max[8];
+    for (int r = 0; r < 8; ++r) {
+        row_min[r] = 1e30f; row_max[r] = -1e30f;
+        const uint32_t alive = uint32_t(p.alive >> 8 * r & 0xff);
+        if (!alive) continue;
+        const f8 x = load<f8>(p.dx + 8 * r), y = load<f8>(p.dy + 8 * r), z = load<f8>(p.dz + 8 * r);
+        const f8 depth = x * axis[0] + y * axis[1] + z * axis[2];
+        if (mask_bits(depth < splat8(0.3f)) & alive) return;
+        const f8 inverse = 1.0f / depth;
+        const f8 su = (x * across[0] + y * across[1] + z * across[2]) * inverse;
+        const f8 sv = (x * down[0] + y * down[1] + z * down[2]) * inverse;
+        const i8v bit = {1, 2, 4, 8, 16, 32, 64, 128};
+        const i8v lives = (bit & int32_t(alive)) != 0;
+        col_min = lives ? vmin(col_min, su) : col_min;
+        col_max = lives ? vmax(col_max, su) : col_max;
+        for (int c = 0; c < 8; ++c)
+            if (alive >> c & 1) { row_min[r] = std::fmin(row_min[r], sv[c]); row_max[r] = std::fmax(row_max[r], sv[c]); }
     }
+    float columns_min[8], columns_max[8];
+    store(columns_min, col_min);
+    store(columns_max, col_max);
     p.u_min = p.v_min = 1e30f; p.u_max = p.v_max = -1e30f;
     for (int k = 0; k < 8; ++k) {
-        p.u_min = std::fmin(p.u_min, p.col_min[k]); p.u_max = std::fmax(p.u_max, p.col_max[k]);
-        p.v_min = std::fmin(p.v_min, p.row_min[k]); p.v_max = std::fmax(p.v_max, p.row_max[k]);
+        p.u_min = std::fmin(p.u_min, columns_min[k]); p.u_max = std::fmax(p.u_max, columns_max[k]);
+        p.v_min = std::fmin(p.v_min, row_min[k]); p.v_max = std::fmax(p.v_max, row_max[k]);
     }
+    p.columns = even_grid(columns_min, columns_max);
+    p.rows = even_grid(row_min, row_max);
     for (int k = 0; k < 3; ++k) { p.axis[k] = axis[k]; p.u[k] = across[k]; p.v[k] = down[k]; }
     p.bounded = true;
 }
 
-struct Entry {  // on the stack: an interior node (leaf < 0) or a leaf
-    int32_t node, leaf;
+struct Entry {  // on the stack: interior node `index`, or leaf `~index`
+    int32_t index;
     float x, y, z, side;
     uint64_t rays;
 };
@@ -109,13 +142,31 @@ inline Interval slopes(f8 across, float radius, f8 near_inverse, f8 far_inverse)
     return {lo * (lo >= 0.0f ? far_inverse : near_inverse), hi * (hi >= 0.0f ? near_inverse : far_inverse)};
 }
 
-inline uint64_t rays_inside(const Packet& p, float u_lo, float u_hi, float v_lo, float v_hi) {
-    const uint64_t cols = mask_bits((load<f8>(p.col_max) >= splat8(u_lo)) & (load<f8>(p.col_min) <= splat8(u_hi)));
-    const uint64_t rows = mask_bits((load<f8>(p.row_max) >= splat8(v_lo)) & (load<f8>(p.row_min) <= splat8(v_hi)));
-    // Row bit r becomes byte r: first one bit in each byte, then all eight, then the columns are kept.
-    const uint64_t ones = 0x0101010101010101ull, one_each = (rows * ones) & 0x8040201008040201ull;
-    const uint64_t bytes = (((one_each + 0x7f7f7f7f7f7f7f7full) | one_each) >> 7 & ones) * 0xff;
-    return bytes & (cols * ones);
+// First and last column (or row) that an interval of slopes may meet, in 0..7; first > last: none.
+struct Range { i8v first, last; };
+
+inline Range range_of(Interval s, const Packet::Grid& g) {
+    const f8 zero = splat8(0.0f), seven = splat8(7.0f);
+    const f8 first = vmin(vmax((s.lo - g.low) * g.per_step, zero), seven) + 0.9999f;  // truncation below makes it the ceiling
+    const f8 last = vmin(vmax((s.hi - g.high) * g.per_step, zero), seven);
+    return {__builtin_convertvector(first, i8v), __builtin_convertvector(last, i8v)};
+}
+
+// For each child the rays, as bits, inside its columns and rows.
+inline u8l rays_inside(Range columns, Range rows) {
+    const i8v bits = (255 << columns.first) & (255 >> (7 - columns.last));
+    const u8l every = {~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull};
+    const u8l from = every << __builtin_convertvector(8 * rows.first, u8l);
+    const u8l to = every >> __builtin_convertvector(56 - 8 * rows.last, u8l);
+    return (__builtin_convertvector(bits, u8l) * 0x0101010101010101ull) & from & to;
+}
+
+// Bits 0..7 of `m` with bit k moved to k ^ flip.
+inline uint32_t flipped(uint32_t m, uint32_t flip) {
+    if (flip & 1) m = (m & 0x55) << 1 | (m >> 1 & 0x55);
+    if (flip & 2) m = (m & 0x33) << 2 | (m >> 2 & 0x33);
+    if (flip & 4) m = (m & 0x0f) << 4 | m >> 4;
+    return m;
 }
 
 class Walk {
@@ -131,7 +182,7 @@ public:
             r_v_ = 0.505f * (std::fabs(p_.v[0]) + std::fabs(p_.v[1]) + std::fabs(p_.v[2]));
             r_w_ = 0.505f * (std::fabs(p_.axis[0]) + std::fabs(p_.axis[1]) + std::fabs(p_.axis[2]));
         }
-        if (tree.n_nodes > 0) stack_[n_++] = {0, -1, 0, 0, 0, 1, p_.alive};
+        if (tree.n_nodes > 0) stack_[n_++] = {0, 0, 0, 0, 1, p_.alive};
     }
 
     // The next leaf that some unfinished ray may meet.
@@ -140,8 +191,8 @@ public:
             const Entry e = stack_[--n_];
             const uint64_t rays = e.rays & p_.alive;
             if (!rays) continue;
-            if (e.leaf >= 0) {
-                leaf = {e.leaf, e.x, e.y, e.z, e.side, rays};
+            if (e.index < 0) {
+                leaf = {~e.index, e.x, e.y, e.z, e.side, rays};
                 return true;
             }
             expand(e, rays);
@@ -152,39 +203,36 @@ public:
 private:
     void expand(const Entry& e, uint64_t rays) {
         const float h = 0.5f * e.side;
-        const uint32_t nodes = tree_.node_mask[e.node], leaves = tree_.leaf_mask[e.node];
+        const uint32_t nodes = tree_.node_mask[e.index], leaves = tree_.leaf_mask[e.index];
         uint32_t present = nodes | leaves;
-        Interval su, sv;
-        uint32_t near = 0;  // children too close for a bound on their slopes
+        alignas(64) uint64_t inside[8] = {rays, rays, rays, rays, rays, rays, rays, rays};
         if (p_.bounded) {
             const float c[3] = {e.x + 0.5f * h - p_.o[0], e.y + 0.5f * h - p_.o[1], e.z + 0.5f * h - p_.o[2]};
             const f8 a = dot3(c, p_.u) + h * off_u_, b = dot3(c, p_.v) + h * off_v_, w = dot3(c, p_.axis) + h * off_w_;
             const f8 w_near = w - (r_w_ * h + 1e-6f), w_far = w + (r_w_ * h + 1e-6f);
-            present &= mask_bits(w_far > 0.0f);
-            near = mask_bits(w_near < splat8(0.02f * h)) & present;
+            const i8v near = w_near < splat8(0.02f * h);  // too close for a bound on their slopes
             const f8 near_inverse = 1.0f / w_near, far_inverse = 1.0f / w_far;
-            su = slopes(a, r_u_ * h + 1e-6f, near_inverse, far_inverse);
-            sv = slopes(b, r_v_ * h + 1e-6f, near_inverse, far_inverse);
-            present &= near | mask_bits((su.hi >= p_.u_min) & (su.lo <= p_.u_max) & (sv.hi >= p_.v_min) & (sv.lo <= p_.v_max));
+            const Interval su = slopes(a, r_u_ * h + 1e-6f, near_inverse, far_inverse);
+            const Interval sv = slopes(b, r_v_ * h + 1e-6f, near_inverse, far_inverse);
+            const u8l all = (u8l)__builtin_convertvector(near, l8);
+            const u8l met = (rays_inside(range_of(su, p_.columns), range_of(sv, p_.rows)) | all) & rays;
+            store(inside, met);
+            const i8v meets = (su.hi >= p_.u_min) & (su.lo <= p_.u_max) & (sv.hi >= p_.v_min) & (sv.lo <= p_.v_max);
+            const i8v some = __builtin_convertvector((l8)(met != 0), i8v);
+            present &= mask_bits((near | meets) & some & (w_far > 0.0f));
         }
         const uint32_t first = (p_.o[0] >= e.x + h ? 4u : 0u) | (p_.o[1] >= e.y + h ? 2u : 0u) | (p_.o[2] >= e.z + h ? 1u : 0u);
-        for (int k = 7; k >= 0; --k) {  // pushed back to front
-            const uint32_t o = first ^ uint32_t(k), bit = 1u << o;
-            if (!(present & bit)) continue;
-            uint64_t inside = rays;
-            if (p_.bounded && !(near & bit)) inside &= rays_inside(p_, su.lo[o], su.hi[o], sv.lo[o], sv.hi[o]);
-            if (!inside) continue;
-            const float x = e.x + (o & 4 ? h : 0.0f), y = e.y + (o & 2 ? h : 0.0f), z = e.z + (o & 1 ? h : 0.0f);
-            if (leaves & bit) {
-                const int32_t leaf = tree_.first_leaf[e.node] + __builtin_popcount(leaves & (bit - 1));
-                __builtin_prefetch(tree_.corners + 8 * int64_t(leaf));
-                stack_[n_++] = {-1, leaf, x, y, z, h, inside};
-            } else {
-                const int32_t node = tree_.first_node[e.node] + __builtin_popcount(nodes & (bit - 1));
-                __builtin_prefetch(tree_.node_mask + node);
-                __builtin_prefetch(tree_.first_leaf + node);
-                stack_[n_++] = {node, -1, x, y, z, h, inside};
-            }
+        uint32_t waiting = flipped(present, first);  // bit k: the k-th child on the way
+        const int32_t first_leaf = tree_.first_leaf[e.index], first_node = tree_.first_node[e.index];
+        while (waiting) {  // pushed back to front
+            const uint32_t k = 31 - uint32_t(__builtin_clz(waiting)), o = first ^ k, bit = 1u << o;
+            waiting ^= 1u << k;
+            const bool is_leaf = leaves & bit;
+            const int32_t leaf = first_leaf + __builtin_popcount(leaves & (bit - 1));
+            const int32_t node = first_node + __builtin_popcount(nodes & (bit - 1));
+            __builtin_prefetch(is_leaf ? static_cast<const void*>(tree_.corners + 8 * int64_t(leaf)) : tree_.first_leaf + node);
+            stack_[n_++] = {is_leaf ? ~leaf : node, e.x + (o & 4 ? h : 0.0f), e.y + (o & 2 ? h : 0.0f),
+                            e.z + (o & 1 ? h : 0.0f), h, inside[o]};
         }
     }
 

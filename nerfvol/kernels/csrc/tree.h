@@ -27,12 +27,19 @@ struct Rays {
     bool origin_per_tile;                        // origins has one row per 64 rays
 };
 
+// A camera's rays: directions in camera axes, tile by tile, rows of tiles from the top; tiles may reach beyond the edges.
+struct View {
+    const float* directions;                     // (tile rows, tile columns, 64, 3) unit length
+    int64_t tile_rows, tile_columns, height, width;
+    float rotation[9], origin[3];                // camera to world, row by row; scene units
+};
+
 struct RenderOptions {
     float background[3];
     float early_stop_eps;                        // a ray ends when its transmittance falls below; 0 = exact
 };
 
-// Outputs, each (n) or (n, 3); null = not wanted.
+// Outputs, each (n) or (n, 3), or (height, width[, 3]) for a view; null = not wanted.
 struct RenderOutput {
     float *rgb, *trans, *depth, *median_depth, *normal;
 };
@@ -73,6 +80,7 @@ struct GradientSink {
 
 struct Kernels {
     void (*render)(const Tree&, const Rays&, const RenderOptions&, const RenderOutput&);
+    void (*render_view)(const Tree&, const View&, const RenderOptions&, const RenderOutput&);
     StepReport (*backward)(const Tree&, const Rays&, const RenderOptions&, const Cotangents*, const Loss*,
                            const GradientSink&, const LeafStatistics&, float pixel_angle);
 };
