@@ -1,7 +1,8 @@
 """The compiled module, where there is one.
 
 The extension is installed at top level (``_nerfvol_kernels``), so that a checkout's Python and an installed package find
-the same build. Without it everything runs on the torch reference, slowly; that is said once.
+the same build. Without it everything runs on the torch reference, slowly; that is said once. Arrays whose rows the
+kernels load as vectors begin on a cache line: :func:`aligned_empty`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,13 @@ import functools
 import os
 import warnings
 from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+CACHE_LINE = 64
+"""Bytes; also the width of the widest vector."""
 
 
 class ReferencePathWarning(UserWarning):
@@ -32,3 +40,24 @@ def native() -> ModuleType | None:
         )
         return None
     return _nerfvol_kernels
+
+
+def aligned_empty(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """An uninitialised C-contiguous array that begins on a cache line.
+
+    numpy's own begin 16 bytes past one once they are large, so that every row of 64 bytes lies on two lines and each
+    load of it costs two. The memory is numpy's all the same, with the large pages it asks the system for.
+    """
+    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    memory = np.empty(size + CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % CACHE_LINE
+    return memory[start : start + size].view(dtype).reshape(shape)
+
+
+def aligned(array: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
+    """``array`` itself where it has the dtype, is C-contiguous and begins on a cache line; else such a copy of it."""
+    if array.dtype == dtype and array.flags.c_contiguous and array.ctypes.data % CACHE_LINE == 0:
+        return array
+    copy = aligned_empty(array.shape, dtype)
+    copy[...] = array
+    return copy

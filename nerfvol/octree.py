@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfvol.errors import InputError
-from nerfvol.native import native
+from nerfvol.native import aligned, aligned_empty, native
 
 MAX_LEVEL = 16
 EMPTY_DENSITY = -7.0
@@ -99,7 +99,7 @@ class Transfer:
 
     def vertices(self, rows: np.ndarray) -> np.ndarray:
         """Old per-vertex rows (n_vertices_old, k), interpolated at the new vertices."""
-        out = np.empty((len(self.place), rows.shape[1]), dtype=rows.dtype)
+        out = aligned_empty((len(self.place), rows.shape[1]), rows.dtype)
         compiled = native()
         if compiled is not None and rows.dtype == np.float32:
             compiled.interpolate(np.ascontiguousarray(rows), self.old_corners, self.source, self.place, out)
@@ -127,7 +127,8 @@ class Octree:
 
     Attributes: origin (3,) float64; size, density_scale float; sh_degree 0-3; node_mask, leaf_mask (n_nodes,) uint8;
     first_node, first_leaf (n_nodes,) int32; leaf_level (n_leaves,) int64; leaf_ijk (n_leaves, 3) int64;
-    corners (n_leaves, 8) int32; values (n_vertices, 16 * blocks) float32, packed rows.
+    corners (n_leaves, 8) int32; values (n_vertices, 16 * blocks) float32, packed rows. The last two begin on a cache
+    line; values that do not are copied when they are assigned.
     """
 
     def __init__(self, node_mask, leaf_mask, *, origin, size: float, sh_degree: int, density_scale: float):
@@ -142,8 +143,9 @@ class Octree:
             self.node_mask, self.leaf_mask
         )
         self.corners, self._vertex_ijk = _number_corners(self.leaf_level, self.leaf_ijk)
-        self.values = np.zeros((len(self._vertex_ijk), 16 * BLOCKS[self.sh_degree]), dtype=np.float32)
-        self.values[:, DENSITY_SLOT] = EMPTY_DENSITY
+        self._values = aligned_empty((len(self._vertex_ijk), 16 * BLOCKS[self.sh_degree]), np.float32)
+        self._values[:] = 0
+        self._values[:, DENSITY_SLOT] = EMPTY_DENSITY
 
     @classmethod
     def from_leaves(
@@ -197,6 +199,15 @@ class Octree:
         return self.origin + self._vertex_ijk * (self.size / 2.0**self.max_level)
 
     # ------------------------------------------------------------------ values
+    @property
+    def values(self) -> np.ndarray:
+        """Packed vertex rows: (n_vertices, 16 * blocks) float32."""
+        return self._values
+
+    @values.setter
+    def values(self, rows) -> None:
+        self._values = aligned(np.asarray(rows), np.float32)
+
     @property
     def density(self) -> np.ndarray:
         """Raw density at the vertices: (n_vertices,), a view."""
@@ -324,7 +335,8 @@ _POPCOUNT = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 
 def convert_rows(rows: np.ndarray, old_degree: int, new_degree: int) -> np.ndarray:
     """Packed vertex rows of one SH degree as those of another: missing bands zero, surplus ones dropped."""
-    out = np.zeros((len(rows), 16 * BLOCKS[new_degree]), dtype=rows.dtype)
+    out = aligned_empty((len(rows), 16 * BLOCKS[new_degree]), rows.dtype)
+    out[:] = 0
     k = (min(old_degree, new_degree) + 1) ** 2
     out[:, sh_slots(new_degree)[:, :k]] = rows[:, sh_slots(old_degree)[:, :k]]
     out[:, DENSITY_SLOT] = rows[:, DENSITY_SLOT]
@@ -404,7 +416,7 @@ def _number_corners(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.
     n = len(level)
     compiled = native()
     if compiled is not None:
-        ids, position = np.empty((n, 8), np.int32), np.empty((8 * n, 3), np.int64)
+        ids, position = aligned_empty((n, 8), np.int32), np.empty((8 * n, 3), np.int64)
         m = compiled.number_corners(level, np.ascontiguousarray(ijk), int(level.max()), ids, position)
         return ids, position[:m].copy()
     scale = (1 << (level.max() - level)).reshape(-1, 1)
@@ -413,7 +425,7 @@ def _number_corners(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.
     order = np.argsort(at)
     rank = np.empty(len(at), np.int32)
     rank[order] = np.arange(len(at), dtype=np.int32)
-    return rank[inverse].reshape(n, 8), demorton(unique[order])
+    return aligned(rank[inverse].reshape(n, 8), np.int32), demorton(unique[order])
 
 
 def _find_sources(new: Octree, parent: np.ndarray, octant: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

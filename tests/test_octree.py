@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import nerfvol.octree as module
 from nerfvol.errors import InputError
-from nerfvol.native import native
+from nerfvol.native import aligned_empty, native
 from nerfvol.octree import (
     BLOCKS,
     DENSITY_SLOT,
@@ -421,6 +421,38 @@ def test_the_deepest_leaves_are_not_subdivided():
     with pytest.raises(InputError, match="subdivide below"):
         octree.subdivide([False, True])  # breadth first: the deep leaf is the second
     octree.subdivide([True, False])
+
+
+def begins_on_a_line(array: np.ndarray) -> bool:
+    return array.ctypes.data % 64 == 0 and array.flags.c_contiguous
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("use_reference", [False, True])
+def test_rows_begin_on_cache_lines(degree, use_reference, monkeypatch):
+    """Large arrays too, which numpy itself places 16 bytes past a line."""
+    if use_reference:
+        monkeypatch.setattr(module, "native", lambda: None)
+    cells = np.stack(np.meshgrid(*[np.arange(16)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    octree = Octree.from_leaves(np.full(len(cells), 4), cells, ORIGIN, SIZE, degree)
+    split, transfer = octree.subdivide(np.arange(octree.n_leaves) % 2 == 0)
+    pruned, _ = split.prune(np.arange(split.n_leaves) % 3 > 0)
+    for t in (octree, split, pruned, octree.with_sh_degree(3)):
+        assert begins_on_a_line(t.corners) and begins_on_a_line(t.values)
+    assert begins_on_a_line(transfer.vertices(np.ones_like(octree.values)))
+
+
+def test_values_are_kept_or_copied_to_a_cache_line():
+    octree = Octree.from_leaves([1], [[0, 0, 0]], ORIGIN, SIZE)
+    fitting = aligned_empty((8, 16), np.float32)
+    octree.values = fitting
+    assert octree.values is fitting
+    memory = np.arange(8 * 16 + 16, dtype=np.float32)
+    start = -memory.ctypes.data % 64 // 4
+    for rows in (memory[start + 4 :][:128], memory[start:][:128].astype(np.float64), memory[start:][:128][::-1]):
+        octree.values = rows.reshape(8, 16)
+        assert begins_on_a_line(octree.values) and octree.values.dtype == np.float32
+        assert np.array_equal(octree.values, rows.reshape(8, 16)) and not np.shares_memory(octree.values, rows)
 
 
 def set_nan(octree):
