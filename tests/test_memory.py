@@ -78,3 +78,13 @@ def test_images_count(dataset):
 
 def test_a_coarse_stage_may_be_the_largest():
     assert largest_octree([6]) == 20 * 4**6 and largest_octree([2]) == 64 and largest_octree([9, 4]) == 20 * 4**9
+
+
+def test_second_moments_begin_on_a_cache_line():
+    octree = make_sphere_octree(6)
+    crooked = np.empty(octree.values.size + 16, np.float32)
+    crooked = crooked[(-crooked.ctypes.data % 64) // 4 + 4 :][: octree.values.size].reshape(octree.values.shape)
+    crooked[:] = 1
+    for state in (ops.TrainState(octree), ops.TrainState(octree, crooked)):
+        assert state.moments.ctypes.data % 64 == 0
+    assert (state.moments == 1).all()

@@ -124,9 +124,7 @@ def test_from_leaves_does_not_depend_on_the_order_of_the_leaves(leaves, seed):
 @given(leaf_sets())
 def test_masks_alone_rebuild_the_octree(leaves):
     a = Octree.from_leaves(*leaves, ORIGIN, SIZE, 2, 3.0)
-    same_octree(
-        a, Octree(a.node_mask, a.leaf_mask, origin=ORIGIN, size=SIZE, sh_degree=2, density_scale=3.0)
-    )
+    same_octree(a, Octree(a.node_mask, a.leaf_mask, origin=ORIGIN, size=SIZE, sh_degree=2, density_scale=3.0))
 
 
 def test_the_deepest_level_is_exact():

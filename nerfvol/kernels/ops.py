@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from nerfvol.kernels import reference
-from nerfvol.native import native
+from nerfvol.native import aligned, aligned_empty, native
 from nerfvol.octree import BLOCKS, Octree
 
 TILE = 64
@@ -309,7 +309,10 @@ class TrainState:
     """
 
     def __init__(self, octree: Octree, moments: np.ndarray | None = None):
-        self.moments = np.zeros_like(octree.values) if moments is None else np.ascontiguousarray(moments, np.float32)
+        if moments is None:
+            moments = aligned_empty(octree.values.shape, np.float32)
+            moments[:] = 0
+        self.moments = aligned(moments, np.float32)
         self.slots = np.full(octree.n_vertices, -1, np.int32)
         self.reset_statistics(octree.n_leaves)
         self.check(octree)
