@@ -39,7 +39,8 @@ def merge_smooth(octree: Octree, coarsest: int, tolerance: float) -> Octree:
 
 
 def _keys(ijk: np.ndarray, level: int) -> np.ndarray:
-    return (ijk[:, 0] << 2 * level) + (ijk[:, 1] << level) + ijk[:, 2]
+    x, y, z = ijk.astype(np.int64).T  # three levels' worth of bits
+    return (x << 2 * level) + (y << level) + z
 
 
 _LATTICE = np.array(list(np.ndindex(3, 3, 3)))

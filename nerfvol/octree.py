@@ -20,16 +20,27 @@ Laine & Karras, *Efficient Sparse Voxel Octrees* (2010).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from nerfvol.errors import InputError
-from nerfvol.native import aligned, aligned_empty, native
+from nerfvol.native import aligned, aligned_empty
+from nerfvol.topology import (
+    MAX_LEVEL,
+    OFFSETS,
+    POPCOUNT,
+    Transfer,
+    build_masks,
+    find_sources,
+    first_children,
+    morton,
+    number_corners,
+    place_leaves,
+    pruned_masks,
+    renumber_corners,
+)
 
-MAX_LEVEL = 16
 EMPTY_DENSITY = -7.0
-OFFSETS = np.array([[o >> 2 & 1, o >> 1 & 1, o & 1] for o in range(8)], dtype=np.int64)
 BLOCKS = {0: 1, 1: 1, 2: 2, 3: 4}
 DENSITY_SLOT = 12
 
@@ -56,94 +67,30 @@ def sh_slots(degree: int) -> np.ndarray:
     return np.where((k == 8) & (degree == 2), 28 + c, slots)
 
 
-def morton(ijk: np.ndarray) -> np.ndarray:
-    """Interleaved bits (x highest) of integer positions (n, 3) < 2**20: (n,) int64."""
-    code = np.zeros(len(ijk), dtype=np.int64)
-    for axis in range(3):
-        v = ijk[:, axis].astype(np.int64)
-        v = (v | v << 32) & 0x1F00000000FFFF
-        v = (v | v << 16) & 0x1F0000FF0000FF
-        v = (v | v << 8) & 0x100F00F00F00F00F
-        v = (v | v << 4) & 0x10C30C30C30C30C3
-        v = (v | v << 2) & 0x1249249249249249
-        code |= v << (2 - axis)
-    return code
-
-
-def demorton(code: np.ndarray) -> np.ndarray:
-    """Inverse of :func:`morton`: (n,) -> (n, 3) int64."""
-    out = np.empty((len(code), 3), dtype=np.int64)
-    for axis in range(3):
-        v = (code >> (2 - axis)) & 0x1249249249249249
-        v = (v | v >> 2) & 0x10C30C30C30C30C3
-        v = (v | v >> 4) & 0x100F00F00F00F00F
-        v = (v | v >> 8) & 0x1F0000FF0000FF
-        v = (v | v >> 16) & 0x1F00000000FFFF
-        v = (v | v >> 32) & 0x1FFFFF
-        out[:, axis] = v
-    return out
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """How per-vertex and per-leaf arrays follow a change of topology.
-
-    parent: (n_leaves_new,) the old leaf that each new leaf is or lies in. old_corners: (n_leaves_old, 8). For each new
-    vertex, source: (n_vertices_new,) an old leaf, and place: index into the 27 points of that leaf's 3x3x3 lattice.
-    """
-
-    parent: np.ndarray
-    old_corners: np.ndarray
-    source: np.ndarray
-    place: np.ndarray
-
-    def vertices(self, rows: np.ndarray) -> np.ndarray:
-        """Old per-vertex rows (n_vertices_old, k), interpolated at the new vertices."""
-        out = aligned_empty((len(self.place), rows.shape[1]), rows.dtype)
-        compiled = native()
-        if compiled is not None and rows.dtype == np.float32:
-            compiled.interpolate(np.ascontiguousarray(rows), self.old_corners, self.source, self.place, out)
-            return out
-        weights = _LATTICE_WEIGHTS.astype(rows.dtype)
-        for start in range(0, len(out), 65536):
-            part = slice(start, start + 65536)
-            w, corners = weights[self.place[part]], self.old_corners[self.source[part]]
-            total = w[:, :1] * rows[corners[:, 0]]
-            for o in range(1, 8):
-                total += w[:, o : o + 1] * rows[corners[:, o]]
-            out[part] = total
-        return out
-
-
-# The 27 points of a leaf's 3x3x3 lattice (index 9 x + 3 y + z) and their trilinear weights at its corners.
-_LATTICE = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
-_LATTICE_WEIGHTS = np.prod(np.where(OFFSETS[None] == 1, _LATTICE[:, None] / 2, 1 - _LATTICE[:, None] / 2), axis=-1)
-_LATTICE_CORNERS = np.flatnonzero((_LATTICE % 2 == 0).all(1))
-_STRIDES = np.array([9, 3, 1])
-
-
 class Octree:
     """See the module's head for the conventions.
 
     Attributes: origin (3,) float64; size, density_scale float; sh_degree 0-3; node_mask, leaf_mask (n_nodes,) uint8;
-    first_node, first_leaf (n_nodes,) int32; leaf_level (n_leaves,) int64; leaf_ijk (n_leaves, 3) int64;
+    first_node, first_leaf (n_nodes,) int32; leaf_level (n_leaves,) int8; leaf_ijk (n_leaves, 3) int32;
     corners (n_leaves, 8) int32; values (n_vertices, 16 * blocks) float32, packed rows. The last two begin on a cache
     line; values that do not are copied when they are assigned.
     """
 
     def __init__(self, node_mask, leaf_mask, *, origin, size: float, sh_degree: int, density_scale: float):
-        self.node_mask = np.ascontiguousarray(node_mask, dtype=np.uint8)
-        self.leaf_mask = np.ascontiguousarray(leaf_mask, dtype=np.uint8)
+        """An octree with these masks (n_nodes,), whole numbers in 0..255; values as in :meth:`from_leaves`.
+
+        Raises InputError where masks or frame (origin, size, degree, scale) describe no octree.
+        """
+        self.node_mask, self.leaf_mask = _as_mask("node_mask", node_mask), _as_mask("leaf_mask", leaf_mask)
         self.origin = np.asarray(origin, dtype=np.float64).reshape(3)
         self.size = float(size)
         self.sh_degree = int(sh_degree)
         self.density_scale = float(density_scale)
         _check_frame(self)
-        self.first_node, self.first_leaf, self.leaf_level, self.leaf_ijk = _expand_topology(
-            self.node_mask, self.leaf_mask
-        )
-        self.corners, self._vertex_ijk = _number_corners(self.leaf_level, self.leaf_ijk)
-        self._values = aligned_empty((len(self._vertex_ijk), 16 * BLOCKS[self.sh_degree]), np.float32)
+        self.first_node, self.first_leaf = first_children(self.node_mask, self.leaf_mask)
+        self.leaf_level, self.leaf_ijk = place_leaves(self.node_mask, self.leaf_mask)
+        self.corners, self._n_vertices = number_corners(self.leaf_level, self.leaf_ijk)
+        self._values = aligned_empty((self.n_vertices, 16 * BLOCKS[self.sh_degree]), np.float32)
         self._values[:] = 0
         self._values[:, DENSITY_SLOT] = EMPTY_DENSITY
 
@@ -153,11 +100,11 @@ class Octree:
     ) -> Octree:
         """An octree with the given leaves, in any order; values are zero and raw density is -7 (nearly empty).
 
-        level: (n,) ints 1..16; ijk: (n, 3) ints in [0, 2**level). Raises InputError where leaves lie outside the root
-        or overlap.
+        level: (n,) whole numbers 1..16; ijk: (n, 3) whole numbers in [0, 2**level). Raises InputError where they are
+        not, and where leaves overlap.
         """
-        level = np.asarray(level, dtype=np.int64).reshape(-1)
-        ijk = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
+        level = _as_whole("leaf levels", level).reshape(-1)
+        ijk = _as_whole("leaf positions", ijk).reshape(-1, 3)
         if len(level) != len(ijk):
             raise InputError(f"level has {len(level)} leaves but ijk has {len(ijk)}")
         if len(level) == 0:
@@ -166,7 +113,7 @@ class Octree:
             raise InputError(f"leaf levels must lie in 1..{MAX_LEVEL}, got {level.min()}..{level.max()}")
         if (ijk < 0).any() or (ijk >= (1 << level)[:, None]).any():
             raise InputError("leaf positions must lie in [0, 2**level), some do not")
-        node_mask, leaf_mask = _build_masks(level, ijk)
+        node_mask, leaf_mask = build_masks(level, ijk)
         return cls(node_mask, leaf_mask, origin=origin, size=size, sh_degree=sh_degree, density_scale=density_scale)
 
     # ------------------------------------------------------------------ sizes and places
@@ -180,7 +127,7 @@ class Octree:
 
     @property
     def n_vertices(self) -> int:
-        return len(self._vertex_ijk)
+        return self._n_vertices
 
     @property
     def max_level(self) -> int:
@@ -188,7 +135,7 @@ class Octree:
 
     def leaf_sizes(self) -> np.ndarray:
         """Side of each leaf in scene units: (n_leaves,) float64."""
-        return self.size / 2.0**self.leaf_level
+        return self.size / (1 << self.leaf_level.astype(np.int64))
 
     def leaf_centers(self) -> np.ndarray:
         """(n_leaves, 3) float64, scene units."""
@@ -196,7 +143,12 @@ class Octree:
 
     def vertex_positions(self) -> np.ndarray:
         """(n_vertices, 3) float64, scene units."""
-        return self.origin + self._vertex_ijk * (self.size / 2.0**self.max_level)
+        finest = self.max_level
+        shift = (finest - self.leaf_level)[:, None]
+        place = np.empty((self.n_vertices, 3), np.int32)
+        for o in range(8):
+            place[self.corners[:, o]] = (self.leaf_ijk + OFFSETS[o]) << shift
+        return self.origin + place * (self.size / 2.0**finest)
 
     # ------------------------------------------------------------------ values
     @property
@@ -252,9 +204,9 @@ class Octree:
             leaves, nodes = self.leaf_mask[node].astype(np.int64), self.node_mask[node].astype(np.int64)
             is_leaf = (leaves >> octant & 1).astype(bool)
             is_node = (nodes >> octant & 1).astype(bool)
-            leaf = self.first_leaf[node] + _POPCOUNT[leaves & below]
+            leaf = self.first_leaf[node] + POPCOUNT[leaves & below]
             result[active[is_leaf]] = leaf[is_leaf]
-            node = (self.first_node[node] + _POPCOUNT[nodes & below])[is_node]
+            node = (self.first_node[node] + POPCOUNT[nodes & below])[is_node]
             active = active[is_node]
             if not len(active):
                 break
@@ -266,8 +218,13 @@ class Octree:
         keep = np.asarray(keep, dtype=bool).reshape(-1)
         if len(keep) != self.n_leaves:
             raise InputError(f"keep must have one entry per leaf ({self.n_leaves}), got {len(keep)}")
-        kept = np.flatnonzero(keep)
-        return self._rebuilt(self.leaf_level[kept], self.leaf_ijk[kept], kept, None)
+        kept = np.flatnonzero(keep).astype(np.int32)
+        if not len(kept):
+            raise InputError("this would leave an octree without leaves")
+        new = self._in_same_frame(*pruned_masks(self.node_mask, self.leaf_mask, keep))
+        new.leaf_level, new.leaf_ijk = self.leaf_level[kept], self.leaf_ijk[kept]
+        new.corners, new._n_vertices = renumber_corners(self.corners, kept, self.n_vertices)
+        return new, self._carry_values(new, kept, np.full(len(kept), -1, np.int8))
 
     def subdivide(self, mask) -> tuple[Octree, Transfer]:
         """Splits the leaves where ``mask`` (n_leaves,) is true into eight.
@@ -278,42 +235,49 @@ class Octree:
         mask = np.asarray(mask, dtype=bool).reshape(-1)
         if len(mask) != self.n_leaves:
             raise InputError(f"mask must have one entry per leaf ({self.n_leaves}), got {len(mask)}")
-        split, whole = np.flatnonzero(mask), np.flatnonzero(~mask)
-        if len(split) and self.leaf_level[split].max() >= MAX_LEVEL:
+        if mask.any() and self.leaf_level[mask].max() >= MAX_LEVEL:
             raise InputError(f"cannot subdivide below level {MAX_LEVEL}")
-        level = np.concatenate([self.leaf_level[whole], np.repeat(self.leaf_level[split] + 1, 8)])
-        children = (2 * self.leaf_ijk[split][:, None] + OFFSETS).reshape(-1, 3)
-        ijk = np.concatenate([self.leaf_ijk[whole], children])
-        parent = np.concatenate([whole, np.repeat(split, 8)])
-        octant = np.concatenate([np.full(len(whole), -1), np.tile(np.arange(8), len(split))])
-        return self._rebuilt(level, ijk, parent, octant)
+        level, ijk, parent, octant = self._split_leaves(mask)
+        new = self._in_same_frame(*build_masks(level, ijk))
+        new.leaf_level, new.leaf_ijk = level, ijk
+        new.corners, new._n_vertices = number_corners(level, ijk)
+        return new, self._carry_values(new, parent, octant)
 
-    def _rebuilt(self, level, ijk, parent, octant) -> tuple[Octree, Transfer]:
-        if len(level) == 0:
-            raise InputError("this would leave an octree without leaves")
-        node_mask, leaf_mask = _build_masks(level, ijk)
-        new = Octree(
-            node_mask,
-            leaf_mask,
-            origin=self.origin,
-            size=self.size,
-            sh_degree=self.sh_degree,
-            density_scale=self.density_scale,
-        )
-        # Bring the description of the new leaves into the new octree's order.
+    def _split_leaves(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The leaves after :meth:`subdivide` in their order: level, position, the old leaf, and which child of it or -1."""
+        split, whole = (np.flatnonzero(chosen).astype(np.int32) for chosen in (mask, ~mask))
+        children = (2 * self.leaf_ijk[split][:, None] + OFFSETS.astype(np.int32)).reshape(-1, 3)
+        ijk = np.concatenate([self.leaf_ijk[whole], children])
+        del children
+        level = np.concatenate([self.leaf_level[whole], np.repeat(self.leaf_level[split] + np.int8(1), 8)])
         order = np.lexsort((morton(ijk), level))
-        octant = np.full(len(order), -1, np.int8) if octant is None else octant[order].astype(np.int8)
-        parent = parent[order]
-        transfer = Transfer(parent, self.corners, *_find_sources(new, parent, octant))
+        level, ijk = level[order], ijk[order]
+        parent = np.concatenate([whole, np.repeat(split, 8)])[order]
+        octant = np.concatenate([np.full(len(whole), -1, np.int8), np.tile(np.arange(8, dtype=np.int8), len(split))])
+        return level, ijk, parent, octant[order]
+
+    def _in_same_frame(self, node_mask: np.ndarray, leaf_mask: np.ndarray) -> Octree:
+        """Another octree in the same root cube, whose leaves have no places, corners or values yet."""
+        new = Octree.__new__(Octree)
+        new.node_mask, new.leaf_mask = node_mask, leaf_mask
+        new.origin, new.size, new.sh_degree, new.density_scale = (
+            self.origin, self.size, self.sh_degree, self.density_scale,
+        )  # fmt: skip
+        new.first_node, new.first_leaf = first_children(node_mask, leaf_mask)
+        return new
+
+    def _carry_values(self, new: Octree, parent: np.ndarray, octant: np.ndarray) -> Transfer:
+        transfer = Transfer(parent, self.corners, *find_sources(new.corners, new.n_vertices, parent, octant))
         new.values = transfer.vertices(self.values)
-        return new, transfer
+        return transfer
 
     def validate(self) -> None:
         """Checks every invariant that the kernels rely on; raises InputError naming the first that fails."""
         fresh = Octree.__new__(Octree)
         fresh.__dict__.update(self.__dict__)
         _check_frame(fresh)
-        first_node, first_leaf, level, ijk = _expand_topology(self.node_mask, self.leaf_mask)
+        first_node, first_leaf = first_children(self.node_mask, self.leaf_mask)
+        level, ijk = place_leaves(self.node_mask, self.leaf_mask)
         for name, array, wanted in (
             ("first_node", self.first_node, first_node),
             ("first_leaf", self.first_leaf, first_leaf),
@@ -324,13 +288,10 @@ class Octree:
                 raise InputError(f"octree: {name} does not follow from the masks")
         if self.corners.shape != (len(level), 8) or self.corners.min() < 0 or self.corners.max() >= self.n_vertices:
             raise InputError("octree: corners point outside the vertices")
-        if self.values.shape != (len(self._vertex_ijk), 16 * BLOCKS[self.sh_degree]):
+        if self.values.shape != (self.n_vertices, 16 * BLOCKS[self.sh_degree]):
             raise InputError(f"octree: values have shape {self.values.shape}")
         if not np.isfinite(self.values).all():
             raise InputError("octree: some vertex values are not finite")
-
-
-_POPCOUNT = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 
 
 def convert_rows(rows: np.ndarray, old_degree: int, new_degree: int) -> np.ndarray:
@@ -352,95 +313,21 @@ def _check_frame(t: Octree) -> None:
         raise InputError(f"density_scale must be positive and finite, got {t.density_scale}")
 
 
-def _build_masks(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Breadth-first masks of the octree with these leaves."""
-    node_masks, leaf_masks = [], []
-    nodes_below = np.empty(0, dtype=np.int64)  # Morton codes of interior nodes one level down
-    for above in range(int(level.max()) - 1, -1, -1):
-        leaves = np.sort(morton(ijk[level == above + 1]))
-        if (np.diff(leaves) == 0).any() or np.isin(leaves, nodes_below, assume_unique=True).any():
-            raise InputError("leaves overlap: one is given twice or lies inside another")
-        parents_l, parents_n = leaves >> 3, nodes_below >> 3
-        nodes = np.sort(np.concatenate([parents_l, parents_n]))
-        nodes = nodes[np.concatenate([[True], nodes[1:] != nodes[:-1]])]
-        masks = []
-        for children, parents in ((leaves, parents_l), (nodes_below, parents_n)):
-            at = np.searchsorted(nodes, parents)
-            bits = np.bincount(at, weights=1 << (children & 7), minlength=len(nodes))  # distinct bits: a sum is an or
-            masks.append(bits.astype(np.uint8))
-        leaf_masks.append(masks[0])
-        node_masks.append(masks[1])
-        nodes_below = nodes
-    return np.concatenate(node_masks[::-1]), np.concatenate(leaf_masks[::-1])
+def _as_mask(name: str, mask) -> np.ndarray:
+    """The mask as contiguous uint8, where that changes no number in it."""
+    given = np.asarray(mask)
+    with np.errstate(invalid="ignore"):  # NaN has no integer
+        narrow = np.ascontiguousarray(given, dtype=np.uint8)
+    if given.dtype != np.uint8 and not np.array_equal(narrow, given):
+        raise InputError(f"octree: {name} must hold whole numbers in 0..255, it does not")
+    return narrow
 
 
-def _expand_topology(node_mask: np.ndarray, leaf_mask: np.ndarray):
-    """first_node, first_leaf, leaf_level, leaf_ijk from the masks; InputError where they describe no octree."""
-    if node_mask.ndim != 1 or node_mask.shape != leaf_mask.shape or len(node_mask) == 0:
-        raise InputError(
-            f"octree masks must be two equal, non-empty vectors, got {node_mask.shape} and {leaf_mask.shape}"
-        )
-    if (node_mask & leaf_mask).any():
-        raise InputError("octree: a child is marked both as an interior node and as a leaf")
-    n_children = _POPCOUNT[node_mask]
-    n_leaves = _POPCOUNT[leaf_mask]
-    if n_children.sum() != len(node_mask) - 1:
-        raise InputError(f"octree: {len(node_mask)} nodes but {n_children.sum()} links to nodes; expected one less")
-    if n_leaves.sum() == 0:
-        raise InputError("octree: no leaves")
-    first_node = (1 + np.cumsum(n_children) - n_children).astype(np.int32)
-    first_leaf = (np.cumsum(n_leaves) - n_leaves).astype(np.int32)
-    level, ijk = [], []
-    start, end = 0, 1
-    codes = np.zeros(1, dtype=np.int64)  # of the nodes in [start, end), all of one level
-    bits = np.arange(8)
-    for depth in range(1, MAX_LEVEL + 1):
-        leaf_bits = (leaf_mask[start:end, None] >> bits & 1).astype(bool)
-        node_bits = (node_mask[start:end, None] >> bits & 1).astype(bool)
-        child = codes[:, None] * 8 + bits
-        ijk.append(demorton(child[leaf_bits]))
-        level.append(np.full(len(ijk[-1]), depth, dtype=np.int64))
-        codes = child[node_bits]
-        if not len(codes):
-            break
-        start, end = end, end + len(codes)
-    else:
-        raise InputError(f"octree: deeper than {MAX_LEVEL} levels")
-    if end != len(node_mask):  # links that sum up but loop: nodes that the walk from the root never meets
-        raise InputError(f"octree: only {end} of {len(node_mask)} nodes hang on the root")
-    return first_node, first_leaf, np.concatenate(level), np.concatenate(ijk)
-
-
-def _number_corners(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices in the order in which leaves name them: corners (n, 8) int32, positions at the finest level (m, 3)."""
-    n = len(level)
-    compiled = native()
-    if compiled is not None:
-        ids, position = aligned_empty((n, 8), np.int32), np.empty((8 * n, 3), np.int64)
-        m = compiled.number_corners(level, np.ascontiguousarray(ijk), int(level.max()), ids, position)
-        return ids, position[:m].copy()
-    scale = (1 << (level.max() - level)).reshape(-1, 1)
-    keys = np.stack([morton((ijk + OFFSETS[o]) * scale) for o in range(8)], 1).reshape(-1)
-    unique, at, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    order = np.argsort(at)
-    rank = np.empty(len(at), np.int32)
-    rank[order] = np.arange(len(at), dtype=np.int32)
-    return aligned(rank[inverse].reshape(n, 8), np.int32), demorton(unique[order])
-
-
-def _find_sources(new: Octree, parent: np.ndarray, octant: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """source and place of :class:`Transfer`; a corner of an old leaf beats a point inside one, the first leaf a later."""
-    source, place = np.empty(new.n_vertices, np.int32), np.empty(new.n_vertices, np.int8)
-    compiled = native()
-    if compiled is not None:
-        compiled.find_sources(new.corners, parent, octant, source, place)
-        return source, place
-    inside = OFFSETS[np.maximum(octant, 0)][:, None] + OFFSETS
-    lattice = np.where((octant < 0)[:, None, None], OFFSETS * 2, inside)
-    places = (lattice @ _STRIDES).astype(np.int8).ravel()
-    leaves, flat = np.repeat(parent, 8), new.corners.ravel()
-    is_corner = np.isin(places, _LATTICE_CORNERS)
-    for chosen in (np.flatnonzero(~is_corner)[::-1], np.flatnonzero(is_corner)[::-1]):  # the first one is written last
-        source[flat[chosen]] = leaves[chosen]
-        place[flat[chosen]] = places[chosen]
-    return source, place
+def _as_whole(what: str, numbers) -> np.ndarray:
+    """The numbers as int64, where that changes none of them."""
+    given = np.asarray(numbers)
+    with np.errstate(invalid="ignore"):
+        whole = given.astype(np.int64)
+    if not np.array_equal(whole, given):
+        raise InputError(f"{what} must be whole numbers, some are not")
+    return whole

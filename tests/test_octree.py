@@ -6,22 +6,19 @@ from hypothesis import given as hypothesis_given
 from hypothesis import settings
 from hypothesis import strategies as st
 
-import nerfvol.octree as module
+import nerfvol.topology as module
 from nerfvol.errors import InputError
 from nerfvol.native import aligned_empty, native
 from nerfvol.octree import (
     BLOCKS,
     DENSITY_SLOT,
     EMPTY_DENSITY,
-    MAX_LEVEL,
-    OFFSETS,
     Octree,
-    demorton,
     explin,
     explin_inverse,
-    morton,
     sh_slots,
 )
+from nerfvol.topology import MAX_LEVEL, OFFSETS, demorton, morton
 
 UNIT_ROUNDOFF = 2.0**-24  # float32
 # Dyadic, so that positions of lattice points are exact and can be compared with ==.

@@ -13,8 +13,9 @@ from safetensors.numpy import load_file, save_file
 
 from nerfvol import octree_codec, octree_io
 from nerfvol.errors import InputError
-from nerfvol.octree import Octree, morton
+from nerfvol.octree import Octree
 from nerfvol.octree_io import describe_octree, load_octree, save_octree
+from nerfvol.topology import morton
 
 BYTE = st.integers(0, 255)
 SETTINGS = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -136,13 +136,19 @@ nb::tuple py_train_step(const TreeArrays& t, Rows origins, Rows directions, Rows
     return nb::make_tuple(r.squared_error, r.weight, r.samples);
 }
 
-int64_t py_number_corners(In<int64_t, nb::ndim<1>> level, In<int64_t, nb::shape<-1, 3>> ijk, int64_t max_level,
-                          Out<int32_t, nb::shape<-1, 8>> ids, Out<int64_t, nb::shape<-1, 3>> position) {
+int64_t py_number_corners(In<int8_t, nb::ndim<1>> level, In<int32_t, nb::shape<-1, 3>> ijk, int max_level,
+                          Out<int32_t, nb::shape<-1, 8>> ids) {
     nb::gil_scoped_release release;
-    return number_corners(level.data(), ijk.data(), int64_t(level.shape(0)), max_level, ids.data(), position.data());
+    return number_corners(level.data(), ijk.data(), int64_t(level.shape(0)), max_level, ids.data());
 }
 
-void py_find_sources(In<int32_t, nb::shape<-1, 8>> corners, In<int64_t, nb::ndim<1>> parent, In<int8_t, nb::ndim<1>> octant,
+int64_t py_renumber_corners(In<int32_t, nb::shape<-1, 8>> corners, In<int32_t, nb::ndim<1>> kept, int64_t n_vertices,
+                            Out<int32_t, nb::shape<-1, 8>> ids) {
+    nb::gil_scoped_release release;
+    return renumber_corners(corners.data(), kept.data(), int64_t(kept.shape(0)), n_vertices, ids.data());
+}
+
+void py_find_sources(In<int32_t, nb::shape<-1, 8>> corners, In<int32_t, nb::ndim<1>> parent, In<int8_t, nb::ndim<1>> octant,
                      Out<int32_t, nb::ndim<1>> source, Out<int8_t, nb::ndim<1>> place) {
     nb::gil_scoped_release release;
     find_sources(corners.data(), parent.data(), octant.data(), int64_t(corners.shape(0)), int64_t(source.shape(0)),
@@ -177,7 +183,8 @@ NB_MODULE(_nerfvol_kernels, m) {
           "early_stop_eps"_a, "colour"_a, "distortion"_a, "pixel_angle"_a, "gradient"_a.none(), "values"_a.none(),
           "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a, "max_weight"_a.none(), "error"_a.none(),
           "footprint"_a.none());
-    m.def("number_corners", &py_number_corners, "level"_a, "ijk"_a, "max_level"_a, "ids"_a, "position"_a);
+    m.def("number_corners", &py_number_corners, "level"_a, "ijk"_a, "max_level"_a, "ids"_a);
+    m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);
     m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);
     m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
     m.def("set_threads", &set_threads, "n"_a);

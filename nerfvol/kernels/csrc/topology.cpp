@@ -1,5 +1,5 @@
 // What follows from a set of leaves: the numbering of their corners, and where the values of new vertices come from.
-// nerfvol/octree.py has the same in numpy, used where nothing is compiled.
+// nerfvol/topology.py has the same in numpy, used where nothing is compiled.
 #include "topology.h"
 
 #include <cstddef>
@@ -34,7 +34,7 @@ bool is_lattice_corner(int place) { return (place / 9) % 2 == 0 && (place / 3) %
 
 }  // namespace
 
-int64_t number_corners(const int64_t* level, const int64_t* ijk, int64_t n, int64_t max_level, int32_t* ids, int64_t* position) {
+int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int max_level, int32_t* ids) {
     int64_t capacity = 1024;
     while (capacity < 4 * n) capacity *= 2;  // a thin shell has about 1.3 vertices per leaf
     std::vector<int32_t> table(std::size_t(capacity), -1);
@@ -45,7 +45,7 @@ int64_t number_corners(const int64_t* level, const int64_t* ijk, int64_t n, int6
         return ((h >> 20) * 64 + (key & 63)) & uint64_t(capacity - 1);
     };
     for (int64_t leaf = 0; leaf < n; ++leaf) {
-        const int shift = int(max_level - level[leaf]);
+        const int shift = max_level - level[leaf];
         for (int o = 0; o < 8; ++o) {
             if (2 * int64_t(keys.size()) >= capacity) {
                 capacity *= 2;
@@ -63,7 +63,6 @@ int64_t number_corners(const int64_t* level, const int64_t* ijk, int64_t n, int6
             while (table[s] >= 0 && keys[std::size_t(table[s])] != key) s = (s + 1) & uint64_t(capacity - 1);
             if (table[s] < 0) {
                 table[s] = int32_t(keys.size());
-                for (int axis = 0; axis < 3; ++axis) position[3 * keys.size() + std::size_t(axis)] = int64_t(p[axis]);
                 keys.push_back(key);
             }
             ids[8 * leaf + o] = table[s];
@@ -72,7 +71,19 @@ int64_t number_corners(const int64_t* level, const int64_t* ijk, int64_t n, int6
     return int64_t(keys.size());
 }
 
-void find_sources(const int32_t* corners, const int64_t* parent, const int8_t* octant, int64_t n, int64_t n_vertices,
+int64_t renumber_corners(const int32_t* corners, const int32_t* kept, int64_t n, int64_t n_vertices, int32_t* ids) {
+    std::vector<int32_t> number(std::size_t(n_vertices), -1);
+    int32_t next = 0;
+    for (int64_t leaf = 0; leaf < n; ++leaf)
+        for (int o = 0; o < 8; ++o) {
+            int32_t& id = number[std::size_t(corners[8 * int64_t(kept[leaf]) + o])];
+            if (id < 0) id = next++;
+            ids[8 * leaf + o] = id;
+        }
+    return next;
+}
+
+void find_sources(const int32_t* corners, const int32_t* parent, const int8_t* octant, int64_t n, int64_t n_vertices,
                   int32_t* source, int8_t* place) {
     for (int64_t v = 0; v < n_vertices; ++v) place[v] = -1;
     for (int64_t leaf = 0; leaf < n; ++leaf)
@@ -81,7 +92,7 @@ void find_sources(const int32_t* corners, const int64_t* parent, const int8_t* o
             const int p = lattice_place(octant[leaf], o);
             if (place[v] < 0 || (is_lattice_corner(p) && !is_lattice_corner(place[v]))) {
                 place[v] = int8_t(p);
-                source[v] = int32_t(parent[leaf]);
+                source[v] = parent[leaf];
             }
         }
 }

@@ -5,12 +5,15 @@
 namespace nerfvol {
 
 // Numbers corners in the order in which leaves name them, so that neighbours in space are neighbours in memory.
-// ids (n, 8); position (8 n, 3), filled for as many vertices as the result says.
-int64_t number_corners(const int64_t* level, const int64_t* ijk, int64_t n, int64_t max_level, int32_t* ids, int64_t* position);
+// ids (n, 8); the result is the number of vertices.
+int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int max_level, int32_t* ids);
+
+// The same for the leaves `kept` (n, rising) of an octree whose corners and vertices are numbered already.
+int64_t renumber_corners(const int32_t* corners, const int32_t* kept, int64_t n, int64_t n_vertices, int32_t* ids);
 
 // For each new vertex an old leaf (source) and its place in that leaf's 3x3x3 lattice; a corner of an old leaf beats a
 // point inside one. octant: which child of `parent` a new leaf is, -1 for the old leaf itself.
-void find_sources(const int32_t* corners, const int64_t* parent, const int8_t* octant, int64_t n, int64_t n_vertices,
+void find_sources(const int32_t* corners, const int32_t* parent, const int8_t* octant, int64_t n, int64_t n_vertices,
                   int32_t* source, int8_t* place);
 
 // Rows of the new vertices, trilinear between the old leaf's corners.
