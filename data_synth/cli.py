@@ -22,7 +22,7 @@ def parser() -> argparse.ArgumentParser:
         prog="nerfvol synth",
         description="Render a scene with a known truth to posed images in the NeRF-synthetic layout.",
     )
-    p.add_argument("scene", metavar="SCENE", help="a scene by name, or 'list' for the names of all scenes")
+    p.add_argument("scene", metavar="SCENE", help="a scene by name, 'list' for all of them, or 'bench' [one|sky|...]")
     p.add_argument("--out", metavar="DIR", help="folder to write (made if it is not there)")
     p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png with a backdrop")
     p.add_argument("--views", type=int, default=60, help="training views; val and test are added (default 60)")
@@ -40,8 +40,12 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str]) -> int:
     """Run ``synth`` with the arguments after the word; the exit code. Bad input is one sentence and code 2."""
-    args = parser().parse_args(argv)
     try:
+        if argv[:1] == ["bench"]:
+            from data_synth.bench import main as bench
+
+            return bench(argv[1:])
+        args = parser().parse_args(argv)
         return _list() if args.scene == "list" else _render(args)
     except InputError as error:
         print(f"nerfvol synth: {error}", file=sys.stderr)

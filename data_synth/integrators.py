@@ -11,18 +11,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from data_synth import march, path, shadowmap
+from data_synth import gather, march, path, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
+from data_synth.gather import Gathered
 from data_synth.image import Picture
 from data_synth.jit import in_bands
 from data_synth.rng import new_rng
-from data_synth.scene import Scene
+from data_synth.scene import Scene, World, has_surfaces
+from data_synth.shadowmap import ShadowMaps
+
+MAP_RESOLUTION = 96  # samples along the longest side of a deep shadow map, unless told otherwise
 
 
 @dataclass(frozen=True)
@@ -33,19 +37,28 @@ class March:
     side: int = 1
     mode: int = field(default=march.MARCHED, repr=False)
 
-    def _maps(self, scene: Scene, world) -> shadowmap.ShadowMaps:
-        return shadowmap.none()
+    def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
+        return shadowmap.none(), None
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
-        world, backdrop, maps = _prepared(self, scene)
+        world, backdrop, maps, gathered = _prepared(self, scene)
+        eye, mode, rho_J = camera.c2w[:3, 3], self.mode, np.empty(0, np.float32)
+        if gathered is not None:
+            if not gather.outside(world.medium, eye):
+                return replace(self, resolution=MAP_RESOLUTION).render(scene, camera, seed)
+            mode, rho_J = march.GATHERED, gather.towards(world, gathered, eye)
+        lighting = march.Lighting(mode, maps, rho_J)
         out, data = np.empty((camera.height, camera.width, 5)), camera.data()
-        in_bands(
-            lambda first, last: march.render_rows(
-                world, backdrop, maps, self.mode, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last
-            ),
-            camera.height,
-            4,
-        )
+
+        def rows(first: int, last: int) -> None:
+            if mode == march.GATHERED and not has_surfaces(world) and not scene.opaque_sky:
+                gather.render_rows(world.medium, rho_J, data, self.side, out, first, last)
+            else:
+                march.render_rows(
+                    world, backdrop, lighting, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last
+                )
+
+        in_bands(rows, camera.height, 4)
         return Picture(out[..., :3], out[..., 3], out[..., 4], samples=self.side**2)
 
 
@@ -65,14 +78,23 @@ class Preview(March):
 
 @dataclass(frozen=True)
 class DeepShadow(March):
-    """Single scattering through deep shadow maps of ``resolution`` samples a side; fill: sweep, eager or lazy."""
+    """Single scattering through deep shadow maps.
 
-    resolution: int = 96
+    resolution: samples along the longest side of a map; None: the samples of the density itself, gathered for each
+    view (``gather.py``) where that is possible, else 96. fill: sweep, eager or lazy.
+    """
+
+    beams: int = 24
+    resolution: int | None = None
     fill: str = "sweep"
     mode: int = field(default=march.MAPPED, repr=False)
 
-    def _maps(self, scene: Scene, world) -> shadowmap.ShadowMaps:
-        return shadowmap.build(world, self.resolution, self.fill)
+    def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
+        together = self.resolution is None and self.fill == "sweep" and gather.possible(world)
+        if together and not has_surfaces(world):
+            return shadowmap.none(), gather.gather(world)
+        maps = shadowmap.build(world, MAP_RESOLUTION if self.resolution is None else self.resolution, self.fill)
+        return maps, gather.gather(world) if together else None
 
 
 @dataclass(frozen=True)
@@ -91,7 +113,7 @@ class Path:
             raise InputError(f"--spp: expected at least 1 sample and depth >= 0, got {self.spp} and {self.max_depth}")
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
-        world, _, _ = _prepared(self, scene)
+        world = _prepared(self, scene).world
         out, data = np.empty((camera.height, camera.width, 8)), camera.data()
         settings = path.Settings(self.spp, self.max_depth, self.jitter, scene.opaque_sky, seed)
 
@@ -113,20 +135,22 @@ def make(name: str, **options):
 
 
 class _Prepared(NamedTuple):
-    world: object
+    world: World
     backdrop: np.ndarray
-    maps: shadowmap.ShadowMaps
+    maps: ShadowMaps
+    gathered: Gathered | None
 
 
 def _prepared(integrator, scene: Scene) -> _Prepared:
     """Arrays and shadow maps of a scene for an integrator, kept on the scene: they do not depend on the camera."""
     store = scene.__dict__.setdefault("_prepared", {})
     if integrator not in store:
-        store.clear()
+        while len(store) > 1:
+            store.pop(next(iter(store)))
         if isinstance(integrator, Path):
-            store[integrator] = _Prepared(scene.world(), np.zeros((0, 16)), shadowmap.none())
+            store[integrator] = _Prepared(scene.world(), np.zeros((0, 16)), shadowmap.none(), None)
         else:
             world = scene.world(integrator.beams)
             backdrop = np.array(scene.lights, float).reshape(-1, 16)
-            store[integrator] = _Prepared(world, backdrop, integrator._maps(scene, world))
+            store[integrator] = _Prepared(world, backdrop, *integrator._light(scene, world))
     return store[integrator]

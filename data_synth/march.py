@@ -4,26 +4,38 @@ Along a ray through the medium, per step with optical thickness dtau at its midp
     L += T (1 - e^-dtau) J(x),   T *= e^-dtau,
     J  = (1 - albedo) Le + albedo sum_lights f_p(wo, wi) L_i(x) T_light(x),
 up to the next surface, which adds T times its directly lit radiance. Lights are beams (points and directions). T_light
-comes from marching to the light, from a deep shadow map, or from the preview's guess.
+comes from marching to the light, from a deep shadow map, or from the preview's guess; or all of J has been gathered at
+the samples of the density (``gather.py``).
 """
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from data_synth import materials, phase
 from data_synth.cameras import pixel_ray
+from data_synth.gather import OPAQUE, march_gathered
 from data_synth.jit import jit, kernel
 from data_synth.lights import escaped, sample_light
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE
 from data_synth.media import attribute, box_interval, extinction, lookup
 from data_synth.rng import reseed
 from data_synth.scene import blocked, inside_medium, next_surface, visible
-from data_synth.shadowmap import look_up
+from data_synth.shadowmap import ShadowMaps, look_up
 from data_synth.spongecake import attenuation
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, dot, largest, mul, neg, scale, sub
 
-MARCHED, MAPPED, PREVIEW, UNLIT = range(4)
-OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
+MARCHED, MAPPED, PREVIEW, UNLIT, GATHERED = range(5)
+
+
+class Lighting(NamedTuple):
+    """Where light in the medium comes from: a mode above, and what it reads. rho_J: of ``gather.towards``."""
+
+    mode: int
+    maps: ShadowMaps
+    rho_J: np.ndarray
 
 
 @jit
@@ -98,7 +110,8 @@ def lit_surface(w, maps, mode, p, n, material, wo, inside, rng):
         if largest(f) <= 0.0:
             continue
         t0, t1 = box_interval((p, wi), m.lo, m.hi)
-        if mode == MAPPED and 0.0 < t0 and not w.bounded:  # the point lies outside the medium: look up where it enters
+        mapped = mode == MAPPED or mode == GATHERED
+        if mapped and 0.0 < t0 and not w.bounded:  # the point lies outside the medium: look up where it enters
             shadow = (1.0, 1.0, 1.0)
             if blocked(w, (p, wi), distance):
                 shadow = (0.0, 0.0, 0.0)
@@ -112,16 +125,22 @@ def lit_surface(w, maps, mode, p, n, material, wo, inside, rng):
 
 
 @jit
-def march_ray(w, maps, mode, ray, inside, rng):
+def march_ray(w, lighting, ray, inside, rng):
     """(L rgb, T rgb, distance sum) of a ray up to its end, single scattering only."""
     state, base = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0), 0.0
+    mode, maps = lighting.mode, lighting.maps
     for _ in range(64):
         t, n, material, quad = next_surface(w, ray)
         if inside:
             t0, t1 = box_interval(ray, w.medium.lo, w.medium.hi)
-            context = (w, maps, mode, inside, base, rng)
-            state, stop = march_medium(w.medium, ray, t0, min(t, t1), True, state, context)
-            if stop:
+            if mode == GATHERED:  # a grey medium, behind grey surfaces at most
+                s = (state[0], state[1], state[2], state[3], state[6])
+                s = march_gathered(w.medium, lighting.rho_J, ray, t0, min(t, t1), base, s)
+                state = (s[0], s[1], s[2], s[3], s[3], s[3], s[4])
+            else:
+                context = (w, maps, mode, inside, base, rng)
+                state, _ = march_medium(w.medium, ray, t0, min(t, t1), True, state, context)
+            if max(state[3], state[4], state[5]) < OPAQUE:
                 break
         if material < 0:
             break
@@ -133,6 +152,7 @@ def march_ray(w, maps, mode, ray, inside, rng):
             inside = dot(d, n) < 0.0 if w.bounded else inside
         elif kind == DIELECTRIC:
             d, inside = bend(n, wo, w.materials.rows[material, 10], inside)
+            mode = MAPPED if mode == GATHERED else mode  # the eye is no longer where the ray comes from
         else:
             if mode != UNLIT:
                 L = add(L, mul(T, lit_surface(w, maps, mode, p, n, material, wo, inside, rng)))
@@ -163,7 +183,7 @@ def bend(n, wo, ior, inside):
 
 
 @kernel
-def render_rows(w, backdrop, maps, mode, camera, side, opaque_sky, rng, out, first, last):
+def render_rows(w, backdrop, lighting, camera, side, opaque_sky, rng, out, first, last):
     """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance; side x side rays per pixel on a regular grid.
 
     backdrop: the light table whose sky is seen behind everything if opaque_sky.
@@ -175,7 +195,7 @@ def render_rows(w, backdrop, maps, mode, camera, side, opaque_sky, rng, out, fir
             r, g, b, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0
             for s in range(side * side):
                 ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
-                state, d = march_ray(w, maps, mode, ray, inside_medium(w, ray), rng)
+                state, d = march_ray(w, lighting, ray, inside_medium(w, ray), rng)
                 T = (state[3], state[4], state[5])
                 seen = mul(T, escaped(backdrop, d)) if opaque_sky else (0.0, 0.0, 0.0)
                 r, g, b = r + state[0] + seen[0], g + state[1] + seen[1], b + state[2] + seen[2]

@@ -99,19 +99,24 @@ def hg_cosine(g, u):
 
 
 @jit
-def evaluate(phase, attribute, wo, wi, rng):
-    """f_p(wo, wi) in 1/sr. The diffuse flakes alone need random numbers; their value is right on average."""
-    cosine = -dot(wo, wi)
+def of_cosine(phase, cosine):
+    """f_p of the phase functions that know the angle alone, for its cosine."""
     if phase.kind == HG:
         f = phase.mix * hg(phase.g1, cosine)
         return f + (1.0 - phase.mix) * hg(phase.g2, cosine) if phase.mix < 1.0 else f
     if phase.kind == RAYLEIGH:
         return 3.0 / (16.0 * math.pi) * (1.0 + cosine * cosine)
+    return 0.25 / math.pi
+
+
+@jit
+def evaluate(phase, attribute, wo, wi, rng):
+    """f_p(wo, wi) in 1/sr. The diffuse flakes alone need random numbers; their value is right on average."""
     if phase.kind == SGGX_SPECULAR:
         return sggx.eval_specular(flakes_at(phase, attribute), wo, wi)
     if phase.kind == SGGX_DIFFUSE:
         return sggx.eval_diffuse(flakes_at(phase, attribute), wo, wi, rng)
-    return 0.25 / math.pi
+    return of_cosine(phase, -dot(wo, wi))
 
 
 @jit

@@ -34,6 +34,11 @@ class World(NamedTuple):
     bounded: bool
 
 
+def has_surfaces(w: World) -> bool:
+    """Whether anything but the medium and the sky can be seen."""
+    return len(w.geometry.shapes) + len(w.geometry.triangles) > 0
+
+
 NOTHING = media.homogeneous((-1e-3,) * 3, (1e-3,) * 3, sigma_t=0.0)
 
 

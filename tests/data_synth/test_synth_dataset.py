@@ -169,7 +169,9 @@ def test_imported_volume_fills_the_scene(tmp_path):
 def test_command_line(tmp_path, capsys):
     assert main(["list"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in scenes.SCENES)
+    for name, line in zip(scenes.SCENES, listed.splitlines(), strict=True):  # one line and one thumbnail each
+        assert line.startswith(name) and f"docs/gallery/{name}.jpg" in line
+        assert (Path(__file__).parents[2] / f"docs/gallery/{name}.jpg").stat().st_size > 1000
     argv = ["slab", "--views", "1", "--size", "6x4", "--set", "sigma=2.0", "--out", str(tmp_path / "o")]
     assert main(argv) == 0
     assert json.loads((tmp_path / "o" / "provenance.json").read_text())["parameters"] == {"sigma": 2.0}
@@ -189,6 +191,7 @@ def test_command_line(tmp_path, capsys):
         (["slab", "--out", "x", "--integrator", "deep"], "emission, path"),
         (["slab", "--out", "x", "--light", "sin"], "did you mean sun?"),
         (["slab"], "--out"),
+        (["bench", "tow"], "one, sky"),
         (["smoke", "--out", "x", "--volume", "missing.vdb"], "missing.vdb"),
     ],
 )

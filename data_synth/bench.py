@@ -1,0 +1,162 @@
+"""The figures of docs/data_synth.md: ``nerfvol synth bench [one|sky|preview|views]``.
+
+Times are wall-clock and CPU seconds (all threads) of whole renders of one view: everything that depends on the lights
+(shadow maps) is made anew in each of the repetitions, of which the median counts. ``view`` is a further view of the
+same scene. Compiled code is warmed up first. error is the sum of |picture - truth| over the sum of the truth, rms the
+root mean square over the mean of the truth, bias the relative error of the mean. The truth is the march with shadow
+rays and a quarter of the step.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from data_synth import clouds, lights, media, phase
+from data_synth.cameras import Viewpoints
+from data_synth.errors import InputError
+from data_synth.image import linear_to_srgb, write_png
+from data_synth.integrators import DeepShadow, March, Path, Preview
+from data_synth.jit import core_count
+from data_synth.scene import Scene
+
+SUN = lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5))
+SKY = lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5))
+
+
+def cumulus(*lit: np.ndarray) -> Scene:
+    """A 128^3 cumulus, 22/u, albedo 0.99, Henyey-Greenstein g = 0.7."""
+    lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
+    rho = clouds.cloud("cumulus", (128, 128, 128), 0.95, 1.0, 0.3, 0)
+    medium = media.grid(rho, lo, hi, 22.0, 0.99, phase=phase.henyey_greenstein(0.7))
+    return Scene("cumulus", medium, lights=list(lit), viewpoints=Viewpoints(radius=4.6), exposure=0.62)
+
+
+def seconds(work: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median (wall, CPU) seconds of ``work``."""
+    taken = []
+    for _ in range(repeats):
+        wall, cpu = time.perf_counter(), time.process_time()
+        work()
+        taken.append((time.perf_counter() - wall, time.process_time() - cpu))
+    return tuple(np.median(taken, axis=0))
+
+
+def errors(picture: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]:
+    """(error, rms, bias) as in the module's text."""
+    d, mean = picture - truth, truth.mean()
+    return np.abs(d).mean() / mean, np.sqrt((d**2).mean()) / mean, d.mean() / mean
+
+
+def single_scattering(title: str, size: int, beams: int, *lit: np.ndarray, repeats: int = 3) -> None:
+    """Rows of a table: shadow rays and deep shadow maps of several kinds, with time and error."""
+    scene = cumulus(*lit)
+    camera = scene.viewpoints.camera(-55, 22, size, size)
+    coarse = cumulus(*lit).viewpoints.camera(-55, 22, 4, 4)
+    methods = {
+        "shadow rays": March(beams=beams),
+        "deep, gathered at the density": DeepShadow(beams=beams),
+        "deep, map of 96": DeepShadow(beams=beams, resolution=96),
+        "deep, map of 192": DeepShadow(beams=beams, resolution=192),
+    }
+    fine = cumulus(*lit)
+    fine.medium = fine.medium._replace(step=fine.medium.step / 4)
+    truth = March(beams=beams).render(fine, camera).rgb
+    print(f"\n{title}, {size}x{size}\n| method | wall s | CPU s | view CPU s | faster | error | rms | bias |")
+    print("|---|---|---|---|---|---|---|---|")
+    slowest = None
+    for name, method in methods.items():
+        method.render(scene, coarse)
+
+        def anew(method=method):
+            scene.__dict__.pop("_prepared", None)
+            return method.render(scene, camera)
+
+        wall, cpu = seconds(anew, repeats)
+        _, again = seconds(lambda method=method: method.render(scene, camera), repeats)
+        slowest = slowest or cpu
+        error, rms, bias = errors(method.render(scene, camera).rgb, truth)
+        print(
+            f"| {name} | {wall:.2f} | {cpu:.2f} | {again:.2f} | {slowest / cpu:.1f} | {error:.2%} | {rms:.2%} "
+            f"| {bias:+.2%} |",
+            flush=True,
+        )
+
+
+def one() -> None:
+    """One sun."""
+    single_scattering("one sun", 256, 1, SUN)
+
+
+def sky() -> None:
+    """A sun and a sky of 12 beams."""
+    single_scattering("a sun and a sky of 12 beams", 64, 12, SUN, SKY, repeats=1)
+
+
+def preview() -> None:
+    """The cloud preview and single scattering against the truth, and the three pictures side by side."""
+    scene = cumulus(SUN, SKY)
+    camera = scene.viewpoints.camera(-55, 22, 160, 160)
+    truth = Path(spp=128, max_depth=64).render(scene, camera)
+    rgb, spread = truth.rgb, np.sqrt(truth.variance.mean()) / truth.rgb.mean()
+    print(f"\npreview, 160x160; truth: path, 128 paths a pixel, 64 events, noise {spread:.1%} of the mean a pixel")
+    print(
+        "| method | CPU s | error | rms | bias | error at the best exposure | correlation |\n|---|---|---|---|---|---|---|"
+    )
+    row = []
+    for name, method in {"preview": Preview(), "single scattering": DeepShadow()}.items():
+        method.render(scene, camera)
+        picture = method.render(scene, camera).rgb
+        _, cpu = seconds(lambda method=method: method.render(scene, camera), 3)
+        error, rms, bias = errors(picture, rgb)
+        fitted = (picture * rgb).sum() / (picture**2).sum() * picture
+        seen = truth.alpha > 0.05
+        correlation = np.corrcoef(picture[seen].ravel(), rgb[seen].ravel())[0, 1]
+        print(
+            f"| {name} | {cpu:.2f} | {error:.1%} | {rms:.1%} | {bias:+.1%} | {errors(fitted, rgb)[0]:.1%} | {correlation:.3f} |"
+        )
+        row.append(method.render(scene, camera).over(0.6))
+    row.append(truth.over(0.6))
+    write_png(
+        "preview.jpg", np.rint(255 * linear_to_srgb(scene.exposure * np.concatenate(row, axis=1))).astype(np.uint8)
+    )
+    print("preview.jpg: preview, single scattering, path tracing")
+
+
+def views() -> None:
+    """The command that writes 100 views of the cumulus, from its first to its last file."""
+    from data_synth.cli import main
+
+    with tempfile.TemporaryDirectory() as folder:
+        wall, cpu = seconds(
+            lambda: main(["cloud", "--out", str(FilePath(folder) / "out"), "--views", "100", "--size", "400x400"]), 1
+        )
+    print(f"117 views (100 training, 5 validation, 12 testing): {wall:.1f} s, {cpu:.1f} CPU s")
+
+
+BENCHES = {"one": one, "sky": sky, "preview": preview, "views": views}
+
+
+def main(names: list[str]) -> int:
+    """Run the named benchmarks, or all."""
+    for name in names:
+        if name not in BENCHES:
+            raise InputError(f"bench: expected one of {', '.join(BENCHES)}, got '{name}'")
+    load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+    print(
+        f"{platform.machine()}, {core_count()} cores, load before the start {load}, Python {platform.python_version()}"
+    )
+    for name in names or BENCHES:
+        BENCHES[name]()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

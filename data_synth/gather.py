@@ -1,0 +1,225 @@
+"""All light gathered at the samples of a density grid: a deep shadow map per beam, summed once per view (PHYSICS 7, 8).
+
+What a point x radiates towards wo is
+    J(x, wo) = (1 - albedo) Le + albedo sum_k f_p(wo, w_k) L_k T_k(x).
+T_k(x), the transmittance to the distant light k, does not depend on the camera: it is swept once per scene and light
+(``sweep.py``) to the density's own samples. Seen from an eye outside the medium wo hardly changes from one sample to
+the next, so that once per view all of J is put down there beside rho, and a marching step costs one trilinear look-up,
+however many beams there are.
+
+An approximation: J is linear between samples. Its error falls with the square of the cell, at a shadow's edge with the
+cell. Not gathered are coloured extinction, microflakes, media that fill boundary surfaces, and lights at a finite
+distance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from data_synth import media, sweep
+from data_synth import phase as phases
+from data_synth.cameras import pixel_ray
+from data_synth.jit import in_bands, in_parallel, jit, kernel
+from data_synth.lights import DIRECTIONAL, column3
+from data_synth.media import BRICK, GRID, Medium, box_interval, lookup
+from data_synth.scene import World, blocked, has_surfaces
+from data_synth.traverse import steps, traversal
+from data_synth.vec import add, along, mul, sub, unit
+
+OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
+SIDE = BRICK + 1
+SAMPLES = SIDE**3  # of a brick
+NEAR = 4.0  # cells: an eye nearer to the medium sees wo turn from sample to sample
+
+
+class Gathered(NamedTuple):
+    """What all views share. corner: (bricks, 3) first sample of every stored brick; T: (beams, samples) float32."""
+
+    corner: np.ndarray
+    T: np.ndarray
+
+
+def possible(w: World) -> bool:
+    """Whether the light in this world may be gathered."""
+    m = w.medium
+    grey = m.sigma_t[0] == m.sigma_t[1] == m.sigma_t[2]
+    distant = bool(np.all(w.lights[:, 0] == DIRECTIONAL))
+    return m.kind == GRID and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not w.bounded
+
+
+def outside(m: Medium, eye) -> bool:
+    """Whether an eye is far enough from the medium."""
+    near = NEAR * np.array(m.cell)
+    return bool(np.any(eye < np.array(m.lo) - near) or np.any(eye > np.array(m.hi) + near))
+
+
+def gather(w: World) -> Gathered:
+    """The transmittance from the stored samples of the medium to all beams."""
+    m = w.medium
+    rho, kept = media.dense(m), np.flatnonzero(m.offsets >= 0)
+    brick = np.unravel_index(kept, m.bricks)
+    corner = np.array(m.lo) + BRICK * np.stack(brick, axis=1) * np.array(m.cell)
+    padding = [(0, BRICK * n + 1 - size) for n, size in zip(m.bricks, rho.shape, strict=True)]
+    T = np.empty((len(w.lights), len(kept) * SAMPLES), np.float32)
+
+    def light(k: int) -> None:
+        swept = np.pad(sweep.thickness(rho, m.cell, tuple(w.lights[k, 7:10])), padding, mode="edge")
+        windows = np.lib.stride_tricks.sliding_window_view(swept, (SIDE,) * 3)[::BRICK, ::BRICK, ::BRICK]
+        np.exp(np.float32(-m.sigma_t[0]) * windows[brick].ravel(), out=T[k])
+        if has_surfaces(w):
+            _block(w, corner, k, T)
+
+    in_parallel(light, [(k,) for k in range(len(w.lights))])
+    return Gathered(corner, T)
+
+
+def towards(w: World, gathered: Gathered, eye) -> np.ndarray:
+    """(4 samples,) float32: rho and the three colours of J towards the eye, sample by sample."""
+    rho_J = np.empty(4 * len(gathered.corner) * SAMPLES, np.float32)
+    eye = tuple(float(x) for x in eye)
+
+    def bricks(first: int, last: int) -> None:
+        _sum_beams(w, gathered, eye, np.empty((7, SAMPLES), np.float32), rho_J, first, last)
+
+    in_bands(bricks, len(gathered.corner), 32)
+    return rho_J
+
+
+@jit
+def sample_point(m, corner, b, s):
+    """Where sample s of stored brick b is."""
+    i, j, k = s // (SIDE * SIDE), s // SIDE % SIDE, s % SIDE
+    return (corner[b, 0] + i * m.cell[0], corner[b, 1] + j * m.cell[1], corner[b, 2] + k * m.cell[2])
+
+
+@kernel
+def _block(w, corner, k, T):
+    """Surfaces keep light k from the samples behind them."""
+    towards_light = column3(w.lights, k, 7)
+    for b in range(corner.shape[0]):
+        for s in range(SAMPLES):
+            if blocked(w, (sample_point(w.medium, corner, b, s), towards_light), math.inf):
+                T[k, b * SAMPLES + s] = 0.0
+
+
+@jit
+def add_beam(phase, wi, L, T, x, y, z, f, red, green, blue):
+    """Add f_p L T of one beam to the colours of a brick's samples, seen towards (x, y, z); f: room for f_p T.
+
+    Short plain loops over rows of numbers, which the compiler turns into vector instructions.
+    """
+    for s in range(SAMPLES):
+        f[s] = -(x[s] * wi[0] + y[s] * wi[1] + z[s] * wi[2])
+    for s in range(SAMPLES):
+        f[s] = phases.of_cosine(phase, f[s]) * T[s]
+    for s in range(SAMPLES):
+        red[s] += L[0] * f[s]
+        green[s] += L[1] * f[s]
+        blue[s] += L[2] * f[s]
+
+
+@kernel
+def _sum_beams(w, gathered, eye, row, rho_J, first, last):
+    """Bricks first..last - 1 of rho_J. row: room for wo, f_p and three colours of a brick's samples."""
+    m, corner, T = w.medium, gathered.corner, gathered.T
+    for b in range(first, last):
+        at = b * SAMPLES
+        for s in range(SAMPLES):
+            row[0, s], row[1, s], row[2, s] = unit(sub(eye, sample_point(m, corner, b, s)))
+            row[4, s], row[5, s], row[6, s] = 0.0, 0.0, 0.0
+        for k in range(T.shape[0]):
+            wi, L = column3(w.lights, k, 7), column3(w.lights, k, 4)
+            part = T[k, at : at + SAMPLES]
+            add_beam(m.phase, wi, L, part, row[0], row[1], row[2], row[3], row[4], row[5], row[6])
+        for s in range(SAMPLES):
+            a = m.attributes[at + s] if m.attributes.size > 1 else 0.0
+            albedo = lookup(m.albedo, a)
+            emitted = mul(sub((1.0, 1.0, 1.0), albedo), lookup(m.Le, a))
+            J = add(emitted, mul(albedo, (row[4, s], row[5, s], row[6, s])))
+            rho_J[4 * (at + s)] = m.samples[at + s]
+            for c in range(3):
+                rho_J[4 * (at + s) + 1 + c] = J[c]
+
+
+@jit
+def four(v, a):
+    """Numbers a..a + 3. Unsigned, because indices that may be negative are checked each time."""
+    return (v[a], v[a + np.uintp(1)], v[a + np.uintp(2)], v[a + np.uintp(3)])
+
+
+@jit
+def mix(f, a, b):
+    return (a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * (b[2] - a[2]), a[3] + f * (b[3] - a[3]))
+
+
+@jit
+def place(m, p):
+    """(first number, three fractions) of the cell around a point of a stored brick, given in cells."""
+    n = m.cells
+    i = min(max(int(p[0]), 0), n[0] - 1)
+    j = min(max(int(p[1]), 0), n[1] - 1)
+    k = min(max(int(p[2]), 0), n[2] - 1)
+    first = m.offsets[np.uintp(((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3))]
+    a = first + ((i & 7) * SIDE + (j & 7)) * SIDE + (k & 7)
+    return np.uintp(4 * a), np.float32(p[0] - i), np.float32(p[1] - j), np.float32(p[2] - k)
+
+
+@jit
+def trilinear(v, a, fu, fv, fw):
+    """The numbers of the eight samples around a cell, mixed."""
+    z, y, x = np.uintp(4), np.uintp(4 * SIDE), np.uintp(4 * SIDE * SIDE)
+    b = a + x
+    low = mix(fv, mix(fw, four(v, a), four(v, a + z)), mix(fw, four(v, a + y), four(v, a + y + z)))
+    high = mix(fv, mix(fw, four(v, b), four(v, b + z)), mix(fw, four(v, b + y), four(v, b + y + z)))
+    return mix(fu, low, high)
+
+
+@jit
+def look_up(m, v, p):
+    """(rho, J rgb) at a point: ``media.trilinear`` of four numbers at a time."""
+    a, fu, fv, fw = place(m, p)
+    return trilinear(v, a, fu, fv, fw)
+
+
+@jit
+def gathered_event(m, ray, t, width, state, context):
+    """One marching step; state = (L rgb, T, sum of weight times distance)."""
+    rho_J, ray_in_cells, base = context
+    x = look_up(m, rho_J, along(ray_in_cells, t))
+    if x[0] <= 0.0:
+        return state, False
+    T = state[3] * math.exp(-x[0] * width * m.sigma_t[0])
+    weight = state[3] - T
+    L = (state[0] + weight * x[1], state[1] + weight * x[2], state[2] + weight * x[3])
+    return (L[0], L[1], L[2], T, state[4] + weight * (base + t)), T < OPAQUE
+
+
+_march = traversal(steps(gathered_event))
+
+
+@jit
+def march_gathered(m, rho_J, ray, t0, t1, base, state):
+    """Fold [t0, t1] of a ray through the medium into state = (L rgb, T, sum of weight times distance)."""
+    o, d, cell = sub(ray[0], m.lo), ray[1], m.cell
+    in_cells = ((o[0] / cell[0], o[1] / cell[1], o[2] / cell[2]), (d[0] / cell[0], d[1] / cell[1], d[2] / cell[2]))
+    return _march(m, ray, t0, t1, True, state, (rho_J, in_cells, base))[0]
+
+
+@kernel
+def render_rows(m, rho_J, camera, side, out, first, last):
+    """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance of a medium that stands alone."""
+    o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
+    share = 1.0 / (side * side)
+    for j in range(first, last):
+        for i in range(out.shape[1]):
+            r, g, b, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0
+            for s in range(side * side):
+                ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
+                t0, t1 = box_interval(ray, m.lo, m.hi)
+                x = march_gathered(m, rho_J, ray, t0, t1, 0.0, (0.0, 0.0, 0.0, 1.0, 0.0))
+                r, g, b, alpha, far = r + x[0], g + x[1], b + x[2], alpha + 1.0 - x[3], far + x[4]
+            out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * share, g * share, b * share
+            out[j, i, 3], out[j, i, 4] = alpha * share, far * share
