@@ -10,6 +10,7 @@ import numpy as np
 from nerfvol.cameras import tile_pixels
 from nerfvol.datasets import Dataset
 from nerfvol.kernels.ops import TILE, Batch
+from nerfvol.native import native
 
 
 @dataclass
@@ -28,34 +29,33 @@ class TileBank:
     """
 
     def __init__(self, dataset: Dataset, background: Sequence[float], k: int):
-        images = dataset.pyramid(background, k)
+        self.pixels = dataset.pyramid(background, k, _tiled)
         cameras = [c.scaled(k) for c in dataset.cameras]
         self.origins = np.stack([c.c2w[:3, 3] for c in cameras]).astype(np.float32)
         self.rotations = np.stack([c.c2w[:3, :3] for c in cameras]).astype(np.float32)
         self.pixel_angle = float(np.median([1 / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras]))
-        self._tables: list[np.ndarray] = []  # camera-space directions in tile order, per distinct intrinsics
-        table_of: dict = {}
-        self._table_of_image = np.empty(len(cameras), np.int64)
-        pixels, insides, image_of, tile_of = [], [], [], []
+        tables: dict = {}  # camera-space directions in tile order, per distinct intrinsics
+        self._directions: list[np.ndarray] = []
+        insides, image_of, tile_of = [], [], []
         plain_colour = np.round(np.asarray(background) * 255).astype(np.uint8)
-        for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        for i, camera in enumerate(cameras):
             intrinsics = camera.intrinsics
             flat = tile_pixels(intrinsics.width, intrinsics.height)
-            if intrinsics not in table_of:
-                table_of[intrinsics] = len(self._tables)
-                self._tables.append(intrinsics.directions().reshape(-1, 3)[np.maximum(flat, 0)])
-            self._table_of_image[i] = table_of[intrinsics]
-            pixels.append(_tiled(image))
+            if intrinsics not in tables:
+                tables[intrinsics] = intrinsics.directions().reshape(-1, 3)[np.maximum(flat, 0)]
+            self._directions.append(tables[intrinsics])
             insides.append(flat >= 0 if (flat < 0).any() else None)
-            image_of.append(np.full(len(flat), i))
-            tile_of.append(np.arange(len(flat)))
+            image_of.append(np.full(len(flat), i, np.int32))
+            tile_of.append(np.arange(len(flat), dtype=np.int32))
         flat_colour = np.tile(plain_colour, TILE)
-        self.plain = np.concatenate([(p.reshape(len(p), -1) == flat_colour).all(1) for p in pixels])
+        self.plain = np.concatenate([(p.reshape(len(p), -1) == flat_colour).all(1) for p in self.pixels])
         self.image = np.concatenate(image_of)
         self.tile = np.concatenate(tile_of)
-        self.pixels = pixels
         self._inside = insides
-        self.rich_tiles, self.plain_tiles = np.flatnonzero(~self.plain), np.flatnonzero(self.plain)
+        self._padded = any(inside is not None for inside in insides)
+        self.rich_tiles, self.plain_tiles = (
+            np.flatnonzero(chosen).astype(np.int32) for chosen in (~self.plain, self.plain)
+        )
 
     @property
     def n_tiles(self) -> int:
@@ -88,12 +88,17 @@ class TileBank:
         directions = np.empty((len(tiles), TILE, 3), np.float32)
         target = np.empty((len(tiles), TILE, 3), np.float32)
         weight = np.repeat(tile_weights[:, None], TILE, 1)
-        for i, (m, t) in enumerate(zip(image, tile, strict=True)):
-            np.matmul(self._tables[self._table_of_image[m]][t], self.rotations[m].T, out=directions[i])
-            target[i] = self.pixels[m][t]
-            if self._inside[m] is not None:
-                weight[i] *= self._inside[m][t]
-        target *= np.float32(1 / 255)
+        if (compiled := native()) is not None:
+            compiled.gather_tiles(self._directions, self.pixels, self.rotations, image, tile, directions, target)
+        else:
+            for i, (m, t) in enumerate(zip(image, tile, strict=True)):
+                np.matmul(self._directions[m][t], self.rotations[m].T, out=directions[i])
+                target[i] = self.pixels[m][t]
+            target *= np.float32(1 / 255)
+        if self._padded:
+            for i, (m, t) in enumerate(zip(image, tile, strict=True)):
+                if self._inside[m] is not None:
+                    weight[i] *= self._inside[m][t]
         return Batch(self.origins[image], directions.reshape(-1, 3), target.reshape(-1, 3), weight.reshape(-1))
 
 
@@ -127,5 +132,6 @@ def _permutation(n: int, seed: tuple[int, ...]) -> np.ndarray:
     if key not in _cached:
         if len(_cached) > 4:
             _cached.clear()
-        _cached[key] = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))).permutation(n)
+        order = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))).permutation(n)
+        _cached[key] = order.astype(np.int32)
     return _cached[key]

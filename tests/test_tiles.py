@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from nerfvol import tiles
 from nerfvol.cameras import Intrinsics, orbit
 from nerfvol.datasets import Dataset, SceneBounds
 from nerfvol.kernels.ops import TILE
@@ -141,3 +142,22 @@ def test_the_angle_of_a_pixel(odd):
     assert one.pixel_angle == pytest.approx(np.median([1 / (1.3 * w) for w in (20, 24, 20, 13)]))
     # A scaled lens drops what does not fill a block, but its focal length is exactly half.
     assert two.pixel_angle == pytest.approx(2 * one.pixel_angle)
+
+
+def test_without_compiled_code_the_batch_is_the_same(odd, monkeypatch):
+    bank = TileBank(odd, WHITE, 1)
+    compiled = whole_batch(bank)
+    monkeypatch.setattr(tiles, "native", lambda: None)
+    plain = whole_batch(bank)
+    # three products and two sums of numbers up to 1, in another order
+    np.testing.assert_allclose(plain.rays_d, compiled.rays_d, rtol=0, atol=4 * np.finfo(np.float32).eps)
+    for name in ("rays_o", "target", "weight"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(compiled, name))
+
+
+def test_tiles_outside_their_picture_are_refused(odd):
+    """The compiled code reads where it is told: it looks first."""
+    bank = TileBank(odd, WHITE, 1)
+    bank.tile = bank.tile + 10**6
+    with pytest.raises(ValueError, match="outside its picture"):
+        whole_batch(bank)

@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "batch.h"
 #include "pool.h"
 #include "topology.h"
 #include "tree.h"
@@ -162,6 +163,27 @@ void py_interpolate(Rows rows, In<int32_t, nb::shape<-1, 8>> corners, In<int32_t
                 out.data());
 }
 
+void py_gather_tiles(const std::vector<In<float, nb::shape<-1, 64, 3>>>& directions,
+                     const std::vector<In<uint8_t, nb::shape<-1, 64, 3>>>& pixels, In<float, nb::shape<-1, 3, 3>> rotations,
+                     In<int64_t, nb::ndim<1>> image, In<int64_t, nb::ndim<1>> tile, Out<float, nb::shape<-1, 64, 3>> out,
+                     Out<float, nb::shape<-1, 64, 3>> target) {
+    TileSources from{{}, {}, rotations.data()};
+    for (const auto& a : directions) from.directions.push_back(a.data());
+    for (const auto& a : pixels) from.pixels.push_back(a.data());
+    const int64_t n = int64_t(image.shape(0)), pictures = int64_t(pixels.size());
+    if (int64_t(tile.shape(0)) != n || int64_t(out.shape(0)) != n || int64_t(target.shape(0)) != n)
+        throw std::invalid_argument("image, tile and both outputs must have one row for each tile");
+    if (int64_t(directions.size()) != pictures || int64_t(rotations.shape(0)) != pictures)
+        throw std::invalid_argument("every picture needs directions, pixels and a rotation");
+    for (int64_t i = 0; i < n; ++i) {
+        const int64_t m = image.data()[i], t = tile.data()[i];
+        if (m < 0 || m >= pictures || t < 0 || t >= int64_t(pixels[size_t(m)].shape(0)) || t >= int64_t(directions[size_t(m)].shape(0)))
+            throw std::invalid_argument("a tile lies outside its picture");
+    }
+    nb::gil_scoped_release release;
+    gather_tiles(from, image.data(), tile.data(), n, out.data(), target.data());
+}
+
 }  // namespace
 
 NB_MODULE(_nerfvol_kernels, m) {
@@ -187,6 +209,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);
     m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);
     m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
+    m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "out"_a, "target"_a);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
     m.def("isa", [] { return std::string(isa_name()); });
