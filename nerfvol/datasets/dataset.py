@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,6 +56,8 @@ class Dataset:
     ``images``: uint8 arrays, (h, w, 3) or (h, w, 4) with straight alpha, as large as their camera's intrinsics say.
     ``names``: one a view, unique, fit for a file name. ``source``: the file the poses came from.
     ``messages``: sentences a person should see (frames left out, how the split was made, how the bounds were found).
+    ``reload``: reads the images again after :meth:`release`; None where they came from no file (a dataset made with
+    dataclasses.replace has none either).
     """
 
     cameras: list[Camera]
@@ -65,6 +67,7 @@ class Dataset:
     source: str
     messages: list[str] = field(default_factory=list)
     threads: int | None = None
+    reload: Callable[[], list[UInt8]] | None = field(default=None, init=False)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -74,15 +77,30 @@ class Dataset:
         """Bytes the images hold."""
         return sum(image.nbytes for image in self.images)
 
+    def release(self) -> None:
+        """Let the images' memory go, where they can be read again: whoever asks for ``images`` next does so."""
+        if self.reload is not None:
+            self.__dict__.pop("images", None)
+
+    def __getattr__(self, name: str) -> list[UInt8]:
+        reload = self.__dict__.get("reload")
+        if name != "images" or reload is None:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        self.images = reload()
+        return self.images
+
     def composited(self, i: int, background: Sequence[float]) -> NDArray[np.float32]:
         """Image i over a background (3,) in [0, 1]: float32 (h, w, 3) in [0, 1]."""
         return composite(self.images[i], background)
 
-    def pyramid(self, background: Sequence[float], k: int) -> list[UInt8]:
+    def pyramid(
+        self, background: Sequence[float], k: int, then: Callable[[UInt8], UInt8] = lambda image: image
+    ) -> list[UInt8]:
         """Every image over a background (3,) in [0, 1], area-averaged over k x k pixels: uint8 (h // k, w // k, 3).
 
-        Their cameras are ``camera.scaled(k)``. Opaque images at k = 1 are returned themselves, not copied.
+        Their cameras are ``camera.scaled(k)``. Opaque images at k = 1 are returned themselves, not copied. ``then`` turns
+        each image into what is kept of it, so that the whole level never stands beside that.
         """
         if not 1 <= k <= 256:
             raise InputError(f"the pyramid's factor must be an integer between 1 and 256, got {k}")
-        return map_threads(lambda image: composite_average(image, background, k), self.images, self.threads)
+        return map_threads(lambda image: then(composite_average(image, background, k)), self.images, self.threads)

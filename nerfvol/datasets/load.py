@@ -23,8 +23,11 @@ SPLITS = ("train", "val", "test")
 
 
 def load_dataset(
-    path: str | os.PathLike[str], split: str = "train", downscale: int = 1,
-    scene_override: SceneBounds | ArrayLike | None = None, threads: int | None = None,
+    path: str | os.PathLike[str],
+    split: str = "train",
+    downscale: int = 1,
+    scene_override: SceneBounds | ArrayLike | None = None,
+    threads: int | None = None,
 ) -> Dataset:
     """Loads one split of a folder of posed images, whatever its format (docs/data.md).
 
@@ -52,16 +55,21 @@ def load_dataset(
     cameras = [camera.scaled(downscale) for camera in full_size]
     _require_memory(cameras, downscale)
 
-    images = map_threads(lambda frame: area_average(read_image(frame.file), downscale), frames, threads)
-    for frame, image, camera in zip(frames, images, cameras, strict=True):
-        if image.shape[:2] != (camera.intrinsics.height, camera.intrinsics.width):
-            raise InputError(f"{frame.path}: the image is not of the size its header declares")
-    images, has_alpha = _settle_alpha(images, listing.source)
+    def decode() -> tuple[list[UInt8], bool]:
+        images = map_threads(lambda frame: area_average(read_image(frame.file), downscale), frames, threads)
+        for frame, image, camera in zip(frames, images, cameras, strict=True):
+            if image.shape[:2] != (camera.intrinsics.height, camera.intrinsics.width):
+                raise InputError(f"{frame.path}: the image is not of the size its header declares")
+        return _settle_alpha(images, listing.source)
+
+    images, has_alpha = decode()
     training = [f for f in listing.training if f.path is not None] or frames
     scene, sentence = _bounds(listing, training, scene_override, has_alpha)
     require_seen(scene, cameras)
     messages.append(sentence)
-    return Dataset(cameras, images, listed_names(frames), scene, str(listing.source), messages, threads)
+    dataset = Dataset(cameras, images, listed_names(frames), scene, str(listing.source), messages, threads)
+    dataset.reload = lambda: decode()[0]
+    return dataset
 
 
 def _read_listing(path: Path, split: str) -> Listing:
@@ -86,7 +94,8 @@ def _present(listing: Listing, messages: list[str]) -> list[Frame]:
     if not present:
         raise InputError(
             f"{listing.source}: none of the {len(missing)} images it lists exists (the first is {missing[0]})"
-            if missing else f"{listing.source}: no images are left for this split"
+            if missing
+            else f"{listing.source}: no images are left for this split"
         )
     if missing:
         shown = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
@@ -152,4 +161,3 @@ def _bounds(
         return bounds_of_box(check_box(override, "the scene's aabb"), has_alpha), "scene bounds: the aabb as given"
     cameras = [_camera(frame, image_size(frame.file), listing.source) for frame in training]
     return estimate_bounds(cameras, has_alpha, listing.hint)
-
