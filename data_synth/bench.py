@@ -1,4 +1,4 @@
-"""The figures of docs/data_synth.md: ``nerfvol synth bench [one|sky|preview|views]``.
+"""The figures of docs/data_synth.md: ``nerfvol synth bench [one|sky|preview|views|mitsuba]``.
 
 Times are wall-clock and CPU seconds (all threads) of whole renders of one view: everything that depends on the lights
 (shadow maps) is made anew in each of the repetitions, of which the median counts. ``view`` is a further view of the
@@ -141,7 +141,14 @@ def views() -> None:
     print(f"117 views (100 training, 5 validation, 12 testing): {wall:.1f} s, {cpu:.1f} CPU s")
 
 
-BENCHES = {"one": one, "sky": sky, "preview": preview, "views": views}
+def mitsuba() -> None:
+    """Path tracing side by side with Mitsuba 3."""
+    from data_synth.bench_mitsuba import main
+
+    main()
+
+
+BENCHES = {"one": one, "sky": sky, "preview": preview, "views": views, "mitsuba": mitsuba}
 
 
 def main(names: list[str]) -> int:
