@@ -9,24 +9,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from nerfvol.datasets import Dataset
 from nerfvol.errors import InputError
 from nerfvol.machine import available_memory
 from nerfvol.octree import BLOCKS
 
-BASE_BYTES = 270 << 20
-"""The interpreter with torch and numpy loaded."""
-LEAF_BYTES = 32 + 8 + 24 + 12
-"""Per leaf: corners (8 int32), level (int64), position (3 int64), three float32 of statistics."""
-VERTEX_BYTES = 4 + 24
-"""Per vertex: a slot (int32) and its lattice position (3 int64), beside two rows of floats."""
-VERTICES_PER_LEAF = 1.25
-"""Vertices of a thin shell of leaves, measured on trained octrees: 1.12 to 1.3."""
-CHANGE_BYTES_PER_LEAF = 250
-"""Per leaf while the octree is rebuilt: what describes the change, and the old octree (an eighth of a split one's size)
-or the new one (half of a pruned one's). Measured with tracemalloc, see the tests."""
-TILE_BYTES_PER_PIXEL = 6
-"""Per training pixel: the image composited to 8-bit RGB, and the same in 8x8 tiles (the former is then let go)."""
+BASE_BYTES = 390 << 20
+"""The interpreter with torch and numpy loaded (228 MiB resident, measured), the kernels' buffers of a step, and memory that
+the allocator keeps between changes of the octree (together 160 MiB, measured on lego at its largest octree)."""
+LEAF_BYTES = 32 + 1 + 12 + 12 + 2
+"""Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
+VERTEX_BYTES = 4
+"""Per vertex: a slot (int32), beside two rows of floats."""
+VERTICES_PER_LEAF = 1.32
+"""Vertices of a thin shell of leaves, measured on trained octrees: 1.12 to 1.4 (lego when largest: 1.33)."""
+CHANGE_BYTES_PER_LEAF = 59 - 24 + 11 + 84
+"""Per leaf while the largest octree is pruned and nearly all of it stays: the new leaves (59, not yet their statistics
+and slots: 24 with the vertices'), what describes the change (parent 4, octant 1, source and place of 1.32 vertices 5 each)
+and the new rows of values (64 a vertex); the second moments follow when the old values are gone. A split needs less: the
+octree before it is a fraction of the one after it."""
+TILE_BYTES_PER_PIXEL = 3.25
+"""Per training pixel: 8-bit RGB, and a 64th of a tile's image, number, place in a queue (int32 each) and colour (bool)."""
+LEAVES_PER_PIXEL = 2.7
+"""Leaves of an octree split down to the pixel, for each pixel of one view: 1.70 million for lego at 800x800."""
 SHARE = 0.9
 """Of the memory at hand that a run may plan for."""
 
@@ -60,12 +67,17 @@ def octree_bytes(leaves: int, sh_degree: int) -> int:
     return int(leaves * (LEAF_BYTES + VERTICES_PER_LEAF * (VERTEX_BYTES + rows)))
 
 
-def estimate_training(dataset: Dataset, leaves: int, sh_degree: int) -> MemoryEstimate:
-    """What training an octree of at most ``leaves`` leaves on ``dataset`` takes."""
-    pixels = sum(image.shape[0] * image.shape[1] for image in dataset.images)
+def estimate_training(dataset: Dataset, leaves: int, sh_degree: int, held_out_bytes: int = 0) -> MemoryEstimate:
+    """What training an octree of at most ``leaves`` leaves on ``dataset`` takes, beside ``held_out_bytes`` of images.
+
+    The octree is largest when the training images stand in tiles and their files' pixels were let go; these count
+    where they are more than what the octree still has to grow by, or cannot be let go.
+    """
+    pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
+    growth = 0 if dataset.reload is None else CHANGE_BYTES_PER_LEAF * leaves + octree_bytes(leaves, sh_degree) // 2
     return MemoryEstimate(
         base=BASE_BYTES,
-        images=dataset.nbytes + TILE_BYTES_PER_PIXEL * pixels,
+        images=int(TILE_BYTES_PER_PIXEL * pixels) + held_out_bytes + max(0, dataset.nbytes - growth),
         octree=octree_bytes(leaves, sh_degree),
         change=CHANGE_BYTES_PER_LEAF * leaves,
         leaves=leaves,
@@ -83,7 +95,12 @@ def require_memory(estimate: MemoryEstimate, available: int | None = None) -> No
 
 
 def affordable_leaves(
-    dataset: Dataset, sh_degree: int, wanted: int, least: int = 1 << 18, available: int | None = None
+    dataset: Dataset,
+    sh_degree: int,
+    wanted: int,
+    least: int = 1 << 18,
+    available: int | None = None,
+    held_out_bytes: int = 0,
 ) -> int:
     """The most leaves, up to ``wanted``, with which training fits in the memory at hand.
 
@@ -93,20 +110,48 @@ def affordable_leaves(
     free = available_memory() if available is None else available
     if free is None:
         return wanted
-    fixed = estimate_training(dataset, 0, sh_degree).peak
-    per_leaf = octree_bytes(1 << 20, sh_degree) / (1 << 20) + CHANGE_BYTES_PER_LEAF
-    leaves = int((SHARE * free - fixed) / per_leaf)
-    if leaves < min(least, wanted):
-        require_memory(estimate_training(dataset, min(least, wanted), sh_degree), free)
-    return min(wanted, leaves)
+
+    def fits(leaves: int) -> bool:
+        return estimate_training(dataset, leaves, sh_degree, held_out_bytes).peak <= SHARE * free
+
+    if fits(wanted):
+        return wanted
+    low, high = min(least, wanted), wanted
+    require_memory(estimate_training(dataset, low, sh_degree, held_out_bytes), free)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
 
 
-def largest_octree(levels: Sequence[int]) -> int:
-    """Leaves to reckon with for stages whose finest levels are ``levels``: a surface's worth, 20 * 4^level, or all.
+def largest_octree(levels: Sequence[int], view_pixels: int | None = None, choosy_from: int = 9) -> int:
+    """Leaves to reckon with for stages whose finest levels are ``levels``: a surface's worth, 12 * 4^level, or all.
 
-    Trained octrees hold about 10 * 4^level leaves after pruning; splitting the level above makes twice that.
+    Splitting every leaf of a trained octree makes about 12 * 4^level. From level ``choosy_from`` on only leaves larger
+    than a pixel are split: LEAVES_PER_PIXEL times the pixels of one view bound those.
     """
-    return max(min(8**level, 20 * 4**level) for level in levels)
+    most = 0
+    for level in levels:
+        leaves = min(8**level, 12 * 4**level)
+        if view_pixels is not None and level >= choosy_from:
+            leaves = min(leaves, int(LEAVES_PER_PIXEL * view_pixels))
+        most = max(most, leaves)
+    return most
+
+
+def splits_within(split: np.ndarray, gain: np.ndarray, most: int | None) -> np.ndarray:
+    """``split`` (n,) bool without the leaves whose splitting would make more than ``most`` leaves; None: no bound.
+
+    Each split makes seven more leaves; those of the largest ``gain`` (n,) are kept, the first of equal ones. Says so.
+    """
+    wanted = np.flatnonzero(split)
+    room = len(wanted) if most is None else max(0, (most - len(split)) // 7)
+    if len(wanted) <= room:
+        return split
+    print(f"memory allows {most:,} leaves: {room:,} of {len(wanted):,} leaves are split, those with the largest error")
+    kept = np.zeros(len(split), dtype=bool)
+    kept[wanted[np.argsort(-gain[wanted], kind="stable")[:room]]] = True
+    return kept
 
 
 def gib(size: int) -> str:

@@ -28,7 +28,7 @@ from nerfvol.datasets.images import composite_average
 from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder
 from nerfvol.machine import process_seconds
-from nerfvol.memory import estimate_training, largest_octree, require_memory
+from nerfvol.memory import affordable_leaves, estimate_training, largest_octree
 from nerfvol.metrics import ssim
 
 FIELD_SHARE = 0.3
@@ -108,12 +108,17 @@ class Run:
         self.interrupted = False
         self.held_out = some_views(load_dataset(config.data, "val", config.downscale), LARGEST_HELD_OUT)
         self.dataset = load_dataset(config.data, "train", config.downscale)
+        self.max_leaves: int | None = None  # no bound
         for message in self.dataset.messages:
             print(message)
         require_something(self.dataset, config.background)
-        estimate = estimate_training(self.dataset, largest_octree(config.octree.levels), config.octree.sh_degree)
-        require_memory(estimate)
         lens = self.dataset.cameras[0].intrinsics
+        held, degree = self.held_out.nbytes, config.octree.sh_degree
+        wanted = largest_octree(config.octree.levels, lens.width * lens.height, config.octree.choosy_from)
+        self.max_leaves = affordable_leaves(self.dataset, degree, wanted, held_out_bytes=held)
+        if self.max_leaves == wanted:
+            self.max_leaves = None
+        estimate = estimate_training(self.dataset, self.max_leaves or wanted, degree, held)
         print(f"{len(self.dataset)} training views of {lens.width}x{lens.height}, {len(self.held_out)} held out; "
               f"memory: {estimate.sentence()}", flush=True)  # fmt: skip
         self.preview_folder = ensure_writable_folder(self.folder / runs.PREVIEWS)
@@ -133,6 +138,7 @@ class Run:
         else:
             self.phase_started, self.running = self.clock.elapsed(), math.nan
         self.phase, self.steps[phase.name] = phase.name, phase.steps_done
+        phase.trainer.max_leaves = self.max_leaves
         self.saved = {"phase": "entered"}  # lets the old arrays go
         if not resumed:
             self.save(phase)
@@ -191,6 +197,9 @@ class Run:
             "trainer": phase.trainer.state_dict(),
         }  # fmt: skip
         save_checkpoint(self.checkpoint, state)
+        left = self.config.octree.downscales[phase.stage :]
+        if phase.name == "octree" and phase.trainer.bank is not None and len(set(left)) == 1:
+            self.dataset.release()  # the tiles at hand serve to the end
         self._last_save = time.perf_counter()
 
     def preview(self, phase: Phase, moment: float) -> None:

@@ -1,5 +1,6 @@
 """The estimate of training memory: sums of real array sizes, and a refusal that says what to try."""
 
+import dataclasses
 import tracemalloc
 
 import numpy as np
@@ -10,7 +11,14 @@ from nerfvol import memory
 from nerfvol.datasets import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
-from nerfvol.memory import affordable_leaves, estimate_training, largest_octree, octree_bytes, require_memory
+from nerfvol.memory import (
+    affordable_leaves,
+    estimate_training,
+    largest_octree,
+    octree_bytes,
+    require_memory,
+    splits_within,
+)
 
 
 @pytest.fixture(scope="module")
@@ -30,27 +38,26 @@ def test_octree_bytes_are_those_of_its_arrays(degree):
 
 
 def test_changing_an_octree_takes_what_is_reckoned_with():
-    """Splitting every leaf and pruning every second one, with the second moments that follow."""
+    """Splitting every leaf, and pruning of which nearly all stays; the second moments follow when the old values are gone."""
     octree = make_sphere_octree(6).with_sh_degree(1)
-    moments = ops.TrainState(octree).moments
+    state = ops.TrainState(octree)
     before = octree_bytes(octree.n_leaves, 1)
+
+    def change(new, transfer):
+        nonlocal octree, state
+        octree = new
+        state = ops.TrainState(new, transfer.vertices(state.moments))
+
     tracemalloc.start()
     try:
-        split, transfer = octree.subdivide(np.ones(octree.n_leaves, bool))
-        moments = transfer.vertices(moments)
-        state = ops.TrainState(split, moments)
-        peak = before + tracemalloc.get_traced_memory()[1]
-        planned = octree_bytes(split.n_leaves, 1) + memory.CHANGE_BYTES_PER_LEAF * split.n_leaves
-        assert 0.6 * planned < peak < 1.1 * planned
-        del transfer
+        change(*octree.subdivide(np.ones(octree.n_leaves, bool)))
+        planned = octree_bytes(octree.n_leaves, 1) + memory.CHANGE_BYTES_PER_LEAF * octree.n_leaves
+        assert before + tracemalloc.get_traced_memory()[1] < 1.1 * planned
         tracemalloc.reset_peak()
-        pruned, transfer = split.prune(np.arange(split.n_leaves) % 2 == 0)
-        transfer.vertices(moments)
-        peak = tracemalloc.get_traced_memory()[1]
-        assert 0.6 * planned < peak < 1.1 * planned
+        change(*octree.prune(np.arange(octree.n_leaves) % 20 > 0))
+        assert 0.8 * planned < tracemalloc.get_traced_memory()[1] < 1.1 * planned
     finally:
         tracemalloc.stop()
-    del state
 
 
 def test_refusal_names_the_parts_and_a_way_out(dataset):
@@ -72,12 +79,30 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
 
 
 def test_images_count(dataset):
-    pixels = 12 * 40 * 40
-    assert estimate_training(dataset, 0, 1).images == 4 * pixels + memory.TILE_BYTES_PER_PIXEL * pixels
+    tiles = int(memory.TILE_BYTES_PER_PIXEL * 12 * 40 * 40)
+    assert estimate_training(dataset, 0, 1).images == 4 * 12 * 40 * 40 + tiles
+    # once the octree is larger than the images that were let go, these count no more
+    assert estimate_training(dataset, 10**6, 1, held_out_bytes=77).images == tiles + 77
 
 
 def test_a_coarse_stage_may_be_the_largest():
-    assert largest_octree([6]) == 20 * 4**6 and largest_octree([2]) == 64 and largest_octree([9, 4]) == 20 * 4**9
+    assert largest_octree([6]) == 12 * 4**6 and largest_octree([2]) == 64 and largest_octree([9, 4]) == 12 * 4**9
+
+
+def test_fine_levels_are_bounded_by_the_pixels():
+    assert largest_octree([8, 9, 10], 800 * 800) == int(2.7 * 800 * 800)
+    assert largest_octree([8, 9, 10], 100) == 12 * 4**8
+
+
+def test_splits_stay_within_the_bound(capsys):
+    split = np.array([True, True, False, True, True])
+    gain = np.array([1.0, 3.0, 9.0, 2.0, 3.0])
+    assert splits_within(split, gain, None) is split and splits_within(split, gain, 33) is split
+    assert not capsys.readouterr().out
+    assert splits_within(split, gain, 32).tolist() == [False, True, False, True, True]
+    assert splits_within(split, gain, 19).tolist() == [False, True, False, False, True]
+    assert "memory allows 19 leaves: 2 of 4" in capsys.readouterr().out
+    assert not splits_within(split, gain, 4).any()
 
 
 def test_second_moments_begin_on_a_cache_line():
@@ -88,3 +113,29 @@ def test_second_moments_begin_on_a_cache_line():
     for state in (ops.TrainState(octree), ops.TrainState(octree, crooked)):
         assert state.moments.ctypes.data % 64 == 0
     assert (state.moments == 1).all()
+
+
+def test_released_images_are_read_again(tiny_scene):
+    dataset = load_dataset(tiny_scene, "train")
+    before = [image.copy() for image in dataset.images]
+    dataset.release()
+    assert "images" not in vars(dataset)
+    assert all(np.array_equal(a, b) for a, b in zip(dataset.images, before, strict=True))
+    part = dataclasses.replace(dataset, images=dataset.images[:2])
+    part.release()  # its images are not those of the files: it keeps them
+    assert len(part.images) == 2
+    with pytest.raises(AttributeError, match="no attribute 'pictures'"):
+        dataset.pictures  # noqa: B018
+
+
+def test_a_pyramid_level_need_not_stand_beside_what_is_made_of_it(dataset):
+    """tracemalloc sees numpy's memory: of the level, 3 bytes a pixel, only an image at a time is there."""
+    pictures = [np.zeros((200, 200, 4), np.uint8)] * len(dataset)
+    large = dataclasses.replace(dataset, images=pictures, threads=1)
+    tracemalloc.start()
+    try:
+        sums = large.pyramid((1.0, 1.0, 1.0), 1, lambda image: image.sum(axis=(0, 1)))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(sums) == len(dataset) and peak < 3 * 200 * 200 * len(dataset)

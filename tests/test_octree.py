@@ -418,6 +418,22 @@ def test_the_deepest_leaves_are_not_subdivided():
     octree.subdivide([True, False])
 
 
+@pytest.mark.parametrize("wrong", [[256], [-1], [1.5], [np.nan]])
+def test_masks_that_uint8_would_change_are_refused(wrong):
+    for node_mask, leaf_mask in ((wrong, [1]), ([0], wrong)):
+        with pytest.raises(InputError, match=r"_mask must hold whole numbers in 0\.\.255"):
+            Octree(node_mask, leaf_mask, origin=ORIGIN, size=SIZE, sh_degree=0, density_scale=1)
+    assert Octree([0], [255.0], origin=ORIGIN, size=SIZE, sh_degree=0, density_scale=1).n_leaves == 8
+
+
+@pytest.mark.parametrize("wrong", [1.5, np.nan])
+def test_fractional_leaves_are_refused(wrong):
+    with pytest.raises(InputError, match="leaf levels must be whole numbers"):
+        Octree.from_leaves([wrong], [[0, 0, 0]], ORIGIN, SIZE)
+    with pytest.raises(InputError, match="leaf positions must be whole numbers"):
+        Octree.from_leaves([1], [[0, wrong, 0]], ORIGIN, SIZE)
+
+
 def begins_on_a_line(array: np.ndarray) -> bool:
     return array.ctypes.data % 64 == 0 and array.flags.c_contiguous
 
