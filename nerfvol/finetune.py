@@ -16,6 +16,7 @@ import numpy as np
 from nerfvol.datasets import Dataset, SceneBounds
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
+from nerfvol.memory import splits_within
 from nerfvol.octree import Octree, Transfer
 from nerfvol.tiles import Cursor, TileBank
 
@@ -24,24 +25,26 @@ from nerfvol.tiles import Cursor, TileBank
 class OctreeConfig:
     """Settings of the octree's optimisation. Shares of progress lie in [0, 1]."""
 
-    steps: int = 9000
+    steps: int = 12000
     """Optimiser steps of the whole schedule when no time budget is given."""
-    levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9])
+    levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
     """Finest level of each stage: level 8 means 256 cells along the region of detail."""
-    downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1])
+    downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1, 1])
     """Image downscale of each stage."""
-    until: list[float] = field(default_factory=lambda: [0.003, 0.008, 0.03, 0.11, 0.40, 1.0])
+    until: list[float] = field(default_factory=lambda: [0.003, 0.008, 0.03, 0.10, 0.35, 0.60, 1.0])
     """Share of progress at which each stage ends."""
-    tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 320, 320, 320])
+    tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 320, 320, 320, 320])
     """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
-    prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 2, 2, 2])
+    prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 2, 2, 2, 2])
     """Prunings inside each stage, evenly spaced."""
     coverage: float = 0.5
     """Pruning waits until this share of the tiles that are not plain background was seen (see _seen_enough for the cap)."""
+    prune_steps: int = 20
+    """... and this many steps were made: a thin start needs some to become visible at all, however few the pictures."""
     sh_degree: int = 1
     rich_share: float = 0.8
     """Share of a batch drawn from tiles that are not plain background."""
-    colour: float = 0.03
+    colour: float = 0.06
     """Weight of the per-sample colour term at the start."""
     distortion: float = 0.05
     """Weight of the distortion term at the start."""
@@ -57,13 +60,16 @@ class OctreeConfig:
     beta: float = 0.98
     prune_weight: float = 0.005
     """Leaves whose largest rendering weight since the last pruning is below are removed."""
+    whole_pixels: float = 2.0
+    """Stages split all leaves larger than this many pixels of their images in some view, down to their level, until ..."""
+    fine_from: int = 9
+    """... this level; from there on a stage splits leaves once, ..."""
     subdivide_pixels: float = 1.0
-    """From level ``choosy_from`` on, leaves are split only while they are larger than this many pixels in some view ..."""
-    subdivide_error: float = 0.97
-    """... and only the fewest leaves that hold this share of the squared error."""
-    choosy_from: int = 9
+    """... those larger than this many pixels ..."""
+    subdivide_error: float = 0.8
+    """... that are among the fewest to hold this share of the squared error."""
     fine_steps: int = 1500
-    """A stage from level ``choosy_from`` on is left out where fewer steps would be left for it."""
+    """A stage from level ``fine_from`` on is left out where fewer steps would be left for it."""
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""
 
@@ -89,6 +95,8 @@ class OctreeTrainer:
         self.prunings = 0
         self.tiles_seen = 0
         self.bank: TileBank | None = None
+        self.max_leaves: int | None = None
+        """Bound on splitting, where memory is short; None: none."""
 
     def _thin_start(self) -> Octree:
         cameras = np.stack([camera.position for camera in self.dataset.cameras])
@@ -162,11 +170,15 @@ class OctreeTrainer:
         old, self.stage, self.prunings = self.stage, self.stage + 1, 0
         error, footprint = self.prune()
         footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
-        wanted = c.levels[self.stage]
-        for _ in range(wanted - min(c.levels[old], wanted)):
-            split = self.octree.leaf_level < leaf_limits(self.octree, self.dataset.scene, wanted)
-            if wanted >= c.choosy_from:
-                split &= (footprint > c.subdivide_pixels) & holds_share(error, c.subdivide_error)
+        wanted, fine = c.levels[self.stage], c.levels[self.stage] >= c.fine_from
+        for _ in range(1 if fine else wanted):
+            split = footprint > (c.subdivide_pixels if fine else c.whole_pixels)
+            split &= self.octree.leaf_level < leaf_limits(self.octree, self.dataset.scene, wanted)
+            if fine:
+                split &= holds_share(error, c.subdivide_error)
+            split = splits_within(split, error, self.max_leaves)
+            if not split.any():
+                break
             transfer = self._change(*self.octree.subdivide(split))
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
         if c.downscales[old] != c.downscales[self.stage]:
@@ -177,13 +189,15 @@ class OctreeTrainer:
         """Whether the next stage, if it is a fine one, will have the steps that it needs at the pace so far."""
         c = self.config
         left = self.step_count * (1 - progress) / max(progress - self._start, 1e-9)
-        return c.levels[self.stage + 1] < c.choosy_from or left >= c.fine_steps
+        return c.levels[self.stage + 1] < c.fine_from or left >= c.fine_steps
 
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
         # Around photographs much is seen at the rim of a few of them only: it takes more tiles to have met it at all.
         enough = 20_000 if self.dataset.scene.background_cube is None else 80_000
-        return self.bank is not None and self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
+        if self.bank is None or self.tiles_seen < self.config.prune_steps * self.config.tiles[self.stage]:
+            return False
+        return self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
 
     def _prune_inside_stage(self, progress: float) -> None:
         c = self.config
@@ -212,7 +226,8 @@ class OctreeTrainer:
         return error, footprint
 
     def _change(self, octree: Octree, transfer: Transfer) -> Transfer:
-        self.octree, self.state = octree, ops.TrainState(octree, transfer.vertices(self.state.moments))
+        self.octree = octree  # the old values go before the moments follow
+        self.state = ops.TrainState(octree, transfer.vertices(self.state.moments))
         return transfer
 
 

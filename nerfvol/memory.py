@@ -124,19 +124,14 @@ def affordable_leaves(
     return low
 
 
-def largest_octree(levels: Sequence[int], view_pixels: int | None = None, choosy_from: int = 9) -> int:
-    """Leaves to reckon with for stages whose finest levels are ``levels``: a surface's worth, 12 * 4^level, or all.
+def largest_octree(levels: Sequence[int], view_pixels: int) -> int:
+    """Leaves to reckon with for stages whose finest levels are ``levels``, the first of which is full from the start.
 
-    Splitting every leaf of a trained octree makes about 12 * 4^level. From level ``choosy_from`` on only leaves larger
-    than a pixel are split: LEAVES_PER_PIXEL times the pixels of one view bound those.
+    Splitting every leaf of a trained octree makes about 12 * 4^level. Since only leaves of more than a pixel are split,
+    LEAVES_PER_PIXEL times the pixels of one view are a bound of their own.
     """
-    most = 0
-    for level in levels:
-        leaves = min(8**level, 12 * 4**level)
-        if view_pixels is not None and level >= choosy_from:
-            leaves = min(leaves, int(LEAVES_PER_PIXEL * view_pixels))
-        most = max(most, leaves)
-    return most
+    surface = max(min(8**level, 12 * 4**level) for level in levels)
+    return max(8 ** levels[0], min(surface, int(LEAVES_PER_PIXEL * view_pixels)))
 
 
 def splits_within(split: np.ndarray, gain: np.ndarray, most: int | None) -> np.ndarray:

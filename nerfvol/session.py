@@ -114,7 +114,7 @@ class Run:
         require_something(self.dataset, config.background)
         lens = self.dataset.cameras[0].intrinsics
         held, degree = self.held_out.nbytes, config.octree.sh_degree
-        wanted = largest_octree(config.octree.levels, lens.width * lens.height, config.octree.choosy_from)
+        wanted = largest_octree(config.octree.levels, lens.width * lens.height)
         self.max_leaves = affordable_leaves(self.dataset, degree, wanted, held_out_bytes=held)
         if self.max_leaves == wanted:
             self.max_leaves = None

@@ -63,7 +63,9 @@ def train(config: Config, started: float | None = None) -> Path:
             del field
         phase = OctreePhase(run, octree)
         optimise(run, phase)
-        finish(run, phase.trainer.octree)
+        octree = phase.trainer.octree
+        del phase  # its tiles and moments are not needed for the scores
+        finish(run, octree)
     return out
 
 

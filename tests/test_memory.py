@@ -85,13 +85,11 @@ def test_images_count(dataset):
     assert estimate_training(dataset, 10**6, 1, held_out_bytes=77).images == tiles + 77
 
 
-def test_a_coarse_stage_may_be_the_largest():
-    assert largest_octree([6]) == 12 * 4**6 and largest_octree([2]) == 64 and largest_octree([9, 4]) == 12 * 4**9
-
-
-def test_fine_levels_are_bounded_by_the_pixels():
-    assert largest_octree([8, 9, 10], 800 * 800) == int(2.7 * 800 * 800)
-    assert largest_octree([8, 9, 10], 100) == 12 * 4**8
+def test_an_octree_is_bounded_by_its_surface_the_pixels_and_its_start():
+    assert largest_octree([6], 10**9) == 8**6 and largest_octree([2, 6], 10**9) == 12 * 4**6
+    assert largest_octree([4, 9, 5], 10**9) == 12 * 4**9
+    assert largest_octree([5, 9, 10], 800 * 800) == int(2.7 * 800 * 800)
+    assert largest_octree([5, 9, 10], 100) == 8**5
 
 
 def test_splits_stay_within_the_bound(capsys):
