@@ -176,6 +176,8 @@ def _eval_arguments(p: _Parser) -> None:
     p.add_argument("--early-stop-eps", metavar="T", help="stop a ray at this transmittance; 0: exact (default: 1/255)")
     p.add_argument("--json", metavar="FILE", help="write scores, per-image rows, seconds per frame and hardware")
     p.add_argument("--save-images", metavar="DIR", help="write truth | render | error | depth for every view")
+    p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
+                   "(with --save-images: slices of both)")  # fmt: skip
 
 
 def _render_arguments(p: _Parser) -> None:

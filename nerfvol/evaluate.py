@@ -102,12 +102,28 @@ def run_eval(options: EvalOptions) -> int:
     scores = evaluate_octree(octree, dataset, background, options.early_stop_eps, on_view)
     record = _record(options, scores, str(path), str(data), background, dataset)
     _print_scores(record, options.split)
+    if options.truth is not None:
+        record["truth"] = _compare_with_truth(octree, options.truth, options.save_images)
     if options.json is not None:
         write_json(options.json, record)
         print(f"scores: {options.json}")
     if options.save_images is not None:
         print(f"pictures (truth | render | error | depth): {options.save_images}")
     return 0
+
+
+def _compare_with_truth(octree: Octree, path: str, folder: str | None) -> dict[str, float]:
+    from nerfvol import truth
+
+    grid = truth.load_grid(path)
+    scores = truth.compare(octree, grid)
+    for name in ("density", "opacity"):
+        print(
+            f"{name}: relative L1 {scores[f'{name}_relative_l1']:.3f}, correlation {scores[f'{name}_correlation']:.4f}"
+        )
+    if folder is not None:
+        truth.write_slices(Path(folder) / "density_slices.png", octree, grid)
+    return scores
 
 
 def _record(

@@ -59,6 +59,7 @@ class EvalOptions:
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
     json: str | None = None
     save_images: str | None = None
+    truth: str | None = None
     threads: int = 0
 
 

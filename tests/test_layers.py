@@ -24,7 +24,7 @@ LAYERS: dict[int, set[str]] = {
     # use: data in, training, pictures and records out
     3: {
         "datasets", "camera_paths", "pictures", "config", "options", "runs", "machine", "memory", "checkpoint", "tiles",
-        "train_field", "distill", "finetune", "session", "trainer", "render", "evaluate",
+        "train_field", "distill", "finetune", "session", "trainer", "render", "evaluate", "truth",
     },
     # what a person calls
     4: {"cli", "viewer", "export", "bench", "info", "demo"},
