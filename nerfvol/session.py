@@ -138,7 +138,6 @@ class Run:
         else:
             self.phase_started, self.running = self.clock.elapsed(), math.nan
         self.phase, self.steps[phase.name] = phase.name, phase.steps_done
-        phase.trainer.max_leaves = self.max_leaves
         self.saved = {"phase": "entered"}  # lets the old arrays go
         if not resumed:
             self.save(phase)

@@ -200,6 +200,7 @@ class OctreePhase:
         config = run.config
         self.background, self.steps = config.background, config.octree.steps
         self.trainer = OctreeTrainer(run.dataset, config.background, config.octree, config.seed, octree)
+        self.trainer.max_leaves = run.max_leaves
 
     @property
     def steps_done(self) -> int:

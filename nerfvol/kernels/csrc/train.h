@@ -10,24 +10,14 @@
 #include <memory>
 #include <mutex>
 
-#include "render.h"
+#include "adjoint.h"
 
 namespace NERFVOL_ISA {
 
-using nerfvol::Cotangents;
 using nerfvol::GradientSink;
 using nerfvol::kBuckets;
 using nerfvol::LeafStatistics;
-using nerfvol::Loss;
 using nerfvol::Optimizer;
-using nerfvol::StepReport;
-
-// Gradient of the loss in the field at one hit: what phase 2 needs, and no more, since it crosses from cache to cache.
-struct PointGradient {
-    f4 value;                             // dL/d(r, g, b, raw density)
-    float fx, fy, fz;                     // place in the leaf
-    int32_t lane;
-};
 
 // A visited leaf, for phase 2. Self-contained, so that phase 2 reads records in a row and nothing else of phase 1's.
 struct LeafGradient {
@@ -47,164 +37,10 @@ struct PacketRecord {
     StepReport report;
 };
 
-// The packet in work: hits front to back, the leaves they lie in, their gradients. Reused by a thread, so that it stays in
-// its cache.
-struct Workspace {
-    std::unique_ptr<Hit[]> hits;
-    std::unique_ptr<PointGradient[]> points;
-    std::vector<Visit> visits;
-    std::vector<int32_t> first_hit;       // of each visit
-    size_t size = 0, capacity = 0;
-
-    Hit* append(size_t n) {
-        if (size + n > capacity) {
-            capacity = std::max<size_t>(4096, 2 * (size + n));
-            std::unique_ptr<Hit[]> larger(new Hit[capacity]);
-            std::copy(hits.get(), hits.get() + size, larger.get());
-            hits = std::move(larger);
-            points.reset(new PointGradient[capacity]);
-        }
-        size += n;
-        return hits.get() + size - n;
-    }
-};
-
 inline int bucket_shift(int64_t n_vertices) {
     int shift = 0;
     while (((n_vertices - 1) >> shift) >= kBuckets) ++shift;
     return shift;
-}
-
-template <int B>
-void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, Workspace& work) {
-    Extinction x;
-    work.size = 0;
-    work.visits.clear();
-    work.first_hit.clear();
-    start(state);
-    march<B>(tree, p, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const LeafField<B>& field) {
-        const int m = __builtin_popcountll(hits);
-        const size_t base = work.size;
-        Hit* h = work.append(size_t(m));
-        int i = 0;
-        for (uint64_t rest = hits; rest; rest &= rest - 1, ++i) {
-            const int l = __builtin_ctzll(rest);
-            h[i].lane = l;
-            h[i].fx = s.fx[l]; h[i].fy = s.fy[l]; h[i].fz = s.fz[l];
-            h[i].length = s.length[l] * tree.size;
-            h[i].middle = s.middle[l];
-            h[i].value = field.at(s.fx[l], s.fy[l], s.fz[l], basis.row[l]);
-            x.raw[i] = h[i].value[3];
-            x.length[i] = h[i].length;
-        }
-        x.evaluate(m, tree.density_scale, true);
-        Visit visit = {leaf.index, m, 0, 0, 1e30f, leaf.side};
-        for (i = 0; i < m; ++i) {
-            const int l = h[i].lane;
-            const float before = state.trans[l], w = before * x.alpha[i];
-            h[i].weight = w;
-            h[i].trans_after = state.trans[l] = before * x.through[i];
-            h[i].tau_slope = x.slope[i];
-            f4 c = h[i].value + 0.5f;
-            c[3] = h[i].middle;
-            state.colour[l] += w * c;
-            visit.max_weight = std::max(visit.max_weight, w);
-            visit.near = std::min(visit.near, h[i].middle);
-            if (h[i].trans_after < eps) p.alive &= ~(1ull << l);
-        }
-        work.visits.push_back(visit);
-        work.first_hit.push_back(int32_t(base));
-    });
-}
-
-// Per ray, what the adjoint needs beside the hits.
-struct Adjoint {
-    f4 colour[kTile];                      // dL/dC, and dL/d(expected distance in root cubes)
-    float behind[kTile];                   // S: starts at T_N q_N
-    float target[kTile][3], colour_weight[kTile], distortion_weight[kTile], error[kTile];
-    float weight_sum[kTile], moment_sum[kTile];          // over all hits, for the distortion loss
-    float weight_behind[kTile], moment_behind[kTile];
-};
-
-inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState& s,
-                                  int64_t first, int n, Adjoint& a) {
-    for (int l = 0; l < n; ++l) {
-        const int64_t i = first + l;
-        float q = c.trans ? c.trans[i] : 0.0f;
-        f4 g{};
-        if (c.rgb)
-            for (int k = 0; k < 3; ++k) { g[k] = c.rgb[3 * i + k]; q += g[k] * options.background[k]; }
-        if (c.depth) g[3] = c.depth[i] * tree.size;
-        a.colour[l] = g;
-        a.behind[l] = s.trans[l] * q;
-        a.colour_weight[l] = a.distortion_weight[l] = a.error[l] = 0;
-        a.weight_sum[l] = a.moment_sum[l] = 0;
-    }
-}
-
-inline void adjoint_of_loss(const Loss& loss, const PacketState& s, int64_t first, int n, Adjoint& a, StepReport& report) {
-    for (int l = 0; l < n; ++l) {
-        const float* target = loss.target + 3 * (first + l);
-        const float weight = loss.weight[first + l];
-        float q = 0, error = 0, miss = 0;
-        f4 g{};
-        for (int k = 0; k < 3; ++k) {
-            const float residual = s.colour[l][k] + s.trans[l] * loss.background[k] - target[k];
-            const float d = loss.background[k] - target[k];
-            a.target[l][k] = target[k];
-            error += residual * residual;
-            miss += d * d;
-            g[k] = 2 * weight * residual;
-            q += g[k] * loss.background[k];
-        }
-        a.colour[l] = g;
-        a.behind[l] = s.trans[l] * (q + weight * loss.colour * miss);
-        a.colour_weight[l] = weight * loss.colour;
-        a.distortion_weight[l] = weight * loss.distortion;
-        a.error[l] = weight * error;
-        a.weight_sum[l] = 1 - s.trans[l];
-        a.moment_sum[l] = s.colour[l][3];
-        report.squared_error += double(weight) * error;
-        report.weight += weight;
-    }
-}
-
-// Back to front: dL/d(r, g, b, raw density) of each hit.
-inline void backward_packet(Workspace& work, Adjoint& a, float per_length) {
-    for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
-    for (size_t v = work.visits.size(); v-- > 0;) {
-        Visit& visit = work.visits[v];
-        const Hit* h = work.hits.get() + work.first_hit[v];
-        PointGradient* point = work.points.get() + work.first_hit[v];
-        for (int i = 0; i < visit.n_hits; ++i) {
-            const int l = h[i].lane;
-            const float w = h[i].weight;
-            f4 c = h[i].value + 0.5f;
-            c[3] = h[i].middle;
-            const f4 product = a.colour[l] * c;
-            float q = product[0] + product[1] + product[2] + product[3];
-            f4 gradient = w * a.colour[l];
-            if (a.colour_weight[l] > 0) {
-                f4 away = {c[0] - a.target[l][0], c[1] - a.target[l][1], c[2] - a.target[l][2], 0};
-                const f4 square = away * away;
-                q += a.colour_weight[l] * (square[0] + square[1] + square[2]);
-                gradient += 2 * a.colour_weight[l] * w * away;
-            }
-            if (a.distortion_weight[l] > 0) {
-                const float m = h[i].middle;
-                const float w_behind = a.weight_behind[l], m_behind = a.moment_behind[l];
-                const float w_front = a.weight_sum[l] - w_behind - w, m_front = a.moment_sum[l] - m_behind - w * m;
-                q += a.distortion_weight[l] * (2 * (m * (w_front - w_behind) - (m_front - m_behind)) +
-                                               (2.0f / 3.0f) * w * h[i].length * per_length);
-                a.weight_behind[l] = w_behind + w;
-                a.moment_behind[l] = m_behind + w * m;
-            }
-            gradient[3] = (h[i].trans_after * q - a.behind[l]) * h[i].tau_slope;
-            a.behind[l] += w * q;
-            point[i] = {gradient, h[i].fx, h[i].fy, h[i].fz, h[i].lane};
-            visit.error += w * a.error[l];
-        }
-    }
 }
 
 // Copies visits and their gradients into the record, bucket by bucket, in the order of the walk within each.
