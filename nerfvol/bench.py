@@ -182,6 +182,7 @@ def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[st
     from nerfvol.fields import Domain, FieldShape, make_field
     from nerfvol.kernels import reference
 
+    ops.set_threads(ops.get_threads())  # torch was loaded only now
     camera = cameras[0]
     origin, directions = camera.rays()
     picked = np.random.default_rng(0).choice(len(directions), REFERENCE_RAYS, replace=False)

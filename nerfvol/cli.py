@@ -291,11 +291,8 @@ def set_threads(threads: int) -> int:
     if threads < 0:
         raise InputError(f"--threads must be 0 (all cores) or more, got {threads}")
     count = threads or usable_cores()
-    import torch
-
     from nerfvol.kernels import ops
 
-    torch.set_num_threads(count)
     ops.set_threads(count)
     return count
 

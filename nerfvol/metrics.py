@@ -7,12 +7,15 @@ network weights that are not shipped, so it is not here. Images are numpy arrays
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Floats = NDArray[np.floating]
 
@@ -88,7 +91,8 @@ def _window_means(maps: Floats) -> Floats:
 
 def _pair(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> tuple[Floats, Floats]:
     """Both as float32 or float64 arrays of one shape; 8-bit images are not taken for values in [0, 1]."""
-    a, b = (np.asarray(x.detach().cpu() if isinstance(x, Tensor) else x) for x in (image, reference))
+    # A tensor that requires a gradient does not turn into an array by itself.
+    a, b = (np.asarray(x.detach().cpu() if hasattr(x, "detach") else x) for x in (image, reference))
     if a.shape != b.shape or a.size == 0:
         raise InputError(f"images to compare must have one shape and some pixels, got {a.shape} and {b.shape}")
     if not (np.issubdtype(a.dtype, np.floating) and np.issubdtype(b.dtype, np.floating)):

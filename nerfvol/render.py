@@ -41,8 +41,7 @@ def render_image(
     """
     lens = camera.intrinsics
     size = (lens.height, lens.width)
-    result = ops.render_view(octree, _tiled_directions(lens), camera.c2w, size, background, early_stop_eps, outputs)
-    return {name: picture.numpy() for name, picture in result.items()}
+    return ops.render_view(octree, _tiled_directions(lens), camera.c2w, size, background, early_stop_eps, outputs)
 
 
 @functools.lru_cache(maxsize=1)

@@ -160,6 +160,7 @@ class FieldPhase:
     def __init__(self, run: Run) -> None:
         from nerfvol.train_field import FieldTrainer
 
+        ops.set_threads(ops.get_threads())  # torch was loaded only now
         self.trainer = FieldTrainer(run.dataset, run.config.field, run.config.seed, run.config.background)
         self.steps, self.stage = run.config.field.steps, 0
 

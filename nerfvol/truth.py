@@ -92,7 +92,7 @@ def compare(octree: Octree, grid: Grid, seed: int = 0) -> dict[str, float]:
     direction = (ends[1] - ends[0]) / length[:, None]
     depth = np.array([_optical_depth(grid, *chord) for chord in zip(ends[0], direction, length, strict=True)])
     # An octree's ray has no end: what lies behind the far end counts for both, and the sphere holds all of the truth.
-    opacity = ops.render_rays(octree, ends[0], direction, early_stop_eps=0.0, outputs=("opacity",))["opacity"].numpy()
+    opacity = ops.render_rays(octree, ends[0], direction, early_stop_eps=0.0, outputs=("opacity",))["opacity"]
     return {
         **_agreement("density", found, grid.sigma.reshape(-1)),
         **_agreement("opacity", opacity.astype(np.float64), -np.expm1(-depth)),

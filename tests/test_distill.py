@@ -129,7 +129,7 @@ def test_opacity_is_the_closed_form() -> None:
     miss = torch.linspace(0, 0.5, 16)
     o = torch.stack([CENTER[0] + miss, CENTER[1] + 0 * miss, CENTER[2] - 3 + 0 * miss], dim=-1)
     d = torch.tensor([[0.0, 0, 1]]).expand(16, 3).contiguous()
-    opacity = render_rays(octree, o, d, (1, 1, 1), 0.0, ("opacity",))["opacity"]
+    opacity = torch.from_numpy(render_rays(octree, o, d, (1, 1, 1), 0.0, ("opacity",))["opacity"])
     half_length = math.erf(1 / (field.width * math.sqrt(2)))
     tau = field.peak * torch.exp(-(miss**2) / (2 * field.width**2)) * field.width * math.sqrt(2 * math.pi) * half_length
     # Coefficient error of the test above at this level, h^2 / 8 * 3 / s^2 = 2.3 %, on tau exp(-tau) <= 1 / e; and the

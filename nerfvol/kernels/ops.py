@@ -1,4 +1,6 @@
-"""The operators on octrees: argument checks, autograd, and the choice between compiled kernels and torch reference.
+"""The operators on octrees, on numpy arrays: argument checks and the choice between compiled kernels and reference.
+
+The same in torch, with gradients, is in ``on_torch``; it is imported only where it is used.
 
 Rays: ``rays_d`` (n, 3) unit directions; ``rays_o`` (n, 3), or (ceil(n / 64), 3) where each run of 64 rays shares its
 origin. The kernels are fast when such a run is an 8x8 tile of one image (cameras.tile_pixels).
@@ -7,13 +9,13 @@ origin. The kernels are fast when such a run is an 8x8 tile of one image (camera
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Sequence
+from types import ModuleType
+from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from nerfvol.kernels import reference
 from nerfvol.kernels.state import DEFAULT_EARLY_STOP, WHITE, Batch, LossOptions, Rates, StepReport, TrainState
 from nerfvol.native import native
 from nerfvol.octree import BLOCKS, Octree
@@ -23,17 +25,24 @@ TILE = 64
 
 # ------------------------------------------------------------------ which code runs
 def set_threads(n: int) -> None:
-    """Threads of the kernels and of torch."""
+    """Threads of the kernels, and of torch where it is loaded or stands in for them."""
     if n < 1:
         raise ValueError(f"threads must be at least 1, got {n}")
-    torch.set_num_threads(n)
     if (compiled := native()) is not None:
         compiled.set_threads(n)
+    if compiled is None or sys.modules.get("torch") is not None:
+        import torch
+
+        torch.set_num_threads(n)
 
 
 def get_threads() -> int:
     compiled = native()
-    return compiled.get_threads() if compiled is not None else torch.get_num_threads()
+    if compiled is not None:
+        return compiled.get_threads()
+    import torch
+
+    return torch.get_num_threads()
 
 
 def available_isas() -> list[str]:
@@ -59,7 +68,8 @@ if native() is not None and "NERFVOL_ISA" in os.environ:
     set_isa(os.environ["NERFVOL_ISA"])
 
 
-def _tree(octree: Octree, values: np.ndarray):
+def kernel_tree(octree: Octree, values: np.ndarray) -> Any:
+    """The kernels' view of ``octree`` with ``values`` (n_vertices, row) in place of its own."""
     compiled = native()
     assert compiled is not None
     shape = (octree.n_vertices, 16 * BLOCKS[octree.sh_degree])
@@ -79,7 +89,7 @@ def _tree(octree: Octree, values: np.ndarray):
     )
 
 
-def _check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
+def check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
     o, d = (np.ascontiguousarray(a, dtype=np.float32) for a in (rays_o, rays_d))
     if d.ndim != 2 or d.shape[1] != 3:
         raise ValueError(f"rays_d must have shape (n, 3), got {d.shape}")
@@ -91,22 +101,23 @@ def _check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
     return o, d
 
 
-def _check_early_stop(eps) -> float:
+def check_early_stop(eps) -> float:
     if not 0 <= eps < 1:  # also refuses NaN
         raise ValueError(f"early_stop_eps must lie in [0, 1), got {eps}")
     return float(eps)
 
 
-def _check_background(background) -> list[float]:
+def check_background(background) -> list[float]:
     values = [float(x) for x in background]
     if len(values) != 3 or not np.isfinite(values).all():
         raise ValueError(f"background must be three finite numbers, got {background}")
     return values
 
 
-def _per_ray(rays_o, n: int) -> Tensor:
-    o = torch.as_tensor(np.asarray(rays_o))
-    return o if len(o) == n else o.repeat_interleave(TILE, 0)[:n]
+def _on_torch() -> ModuleType:
+    from nerfvol.kernels import on_torch
+
+    return on_torch
 
 
 # ------------------------------------------------------------------ rendering
@@ -120,21 +131,21 @@ def render_rays(
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
-) -> dict[str, Tensor]:
+) -> dict[str, np.ndarray]:
     """Renders rays.
 
-    Returns float32 tensors for the names in ``outputs``: rgb (n, 3) over ``background``, opacity 1 - T (n,), depth
+    Returns float32 arrays for the names in ``outputs``: rgb (n, 3) over ``background``, opacity 1 - T (n,), depth
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
     by less than that; 0 is exact.
     """
-    o, d = _check_rays(rays_o, rays_d)
-    bg, eps = _check_background(background), _check_early_stop(early_stop_eps)
+    o, d = check_rays(rays_o, rays_d)
+    bg, eps = check_background(background), check_early_stop(early_stop_eps)
     _check_outputs(outputs)
     if (compiled := native()) is None:
-        return _render_reference(octree, o, d, bg, eps, outputs)
+        return _on_torch().render_rays(octree, o, d, bg, eps, outputs)
     out = _empty_outputs(outputs, (len(d),))
-    tree = _tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
+    tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
     compiled.render(tree, o, d, bg, eps, *(out.get(name) for name in OUTPUTS))
     return _finished(out)
 
@@ -147,7 +158,7 @@ def render_view(
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
-) -> dict[str, Tensor]:
+) -> dict[str, np.ndarray]:
     """Renders a camera's picture of ``size`` (height, width); results as in :func:`render_rays`, (height, width[, 3]).
 
     directions: (tile rows, tile columns, 64, 3) float32 unit directions in camera axes, one row of 64 for each 8x8 tile;
@@ -160,15 +171,15 @@ def render_view(
     rotation, origin = np.asarray(camera_to_world)[:3, :3], np.asarray(camera_to_world, np.float32)[:3, 3]
     if not np.isfinite(camera_to_world).all():
         raise ValueError("camera_to_world must be finite")
-    bg, eps = _check_background(background), _check_early_stop(early_stop_eps)
+    bg, eps = check_background(background), check_early_stop(early_stop_eps)
     _check_outputs(outputs)
     if (compiled := native()) is None:
         flat = directions.reshape(-1, 3) @ rotation.T.astype(np.float32)
         origins = np.broadcast_to(origin, (len(flat) // TILE, 3)).copy()
-        rays = _render_reference(octree, origins, flat, bg, eps, outputs)
+        rays = _on_torch().render_rays(octree, origins, flat, bg, eps, outputs)
         return {name: _from_tiles(rows, tiles[0], tiles[1])[:height, :width] for name, rows in rays.items()}
     out = _empty_outputs(outputs, (height, width))
-    tree = _tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
+    tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
     frame = (rotation.ravel().tolist(), origin.tolist(), height, width)
     compiled.render_view(tree, directions, *frame, bg, eps, *(out.get(name) for name in OUTPUTS))
     return _finished(out)
@@ -185,86 +196,24 @@ def _empty_outputs(outputs: Sequence[str], shape: tuple[int, ...]) -> dict[str, 
     return {k: np.empty((*shape, 3) if k in vectors else shape, np.float32) for k in OUTPUTS if k in outputs}
 
 
-def _finished(out: dict[str, np.ndarray]) -> dict[str, Tensor]:
+def _finished(out: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if "opacity" in out:
         np.subtract(1, out["opacity"], out=out["opacity"])
-    return {k: torch.from_numpy(v) for k, v in out.items()}
+    return out
 
 
-def _from_tiles(rows: Tensor, down: int, across: int) -> Tensor:
+def _from_tiles(rows: np.ndarray, down: int, across: int) -> np.ndarray:
     """(down * across * 64, ...) in tiles as a picture (8 down, 8 across, ...)."""
     tiles = rows.reshape(down, across, 8, 8, *rows.shape[1:])
-    return tiles.transpose(1, 2).reshape(8 * down, 8 * across, *rows.shape[1:])
-
-
-def _render_reference(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -> dict[str, Tensor]:
-    parts = []
-    values = torch.from_numpy(octree.values)
-    origins, directions = _per_ray(o, len(d)), torch.from_numpy(d)
-    with torch.no_grad():
-        for ro, rd in zip(origins.split(chunk), directions.split(chunk), strict=True):
-            rgb, trans, depth = reference.render(octree, values, ro, rd, torch.tensor(bg), eps)
-            part = {"rgb": rgb, "opacity": 1 - trans, "depth": depth}
-            if "median_depth" in outputs:
-                part["median_depth"] = reference.median_depth(
-                    octree, reference.sample(octree, values, ro, rd, eps), len(rd)
-                )
-            if "normal" in outputs:
-                part["normal"] = reference.normals(octree, values, ro, rd, eps)
-            parts.append(part)
-    return {k: torch.cat([p[k] for p in parts]) for k in OUTPUTS if k in outputs}
-
-
-class _Render(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, values, octree, o, d, bg, eps):
-        compiled = native()
-        n = len(d)
-        rgb, trans, depth = (np.empty(shape, np.float32) for shape in ((n, 3), n, n))
-        compiled.render(_tree(octree, values.detach().numpy()), o, d, bg, eps, rgb, trans, depth, None, None)
-        ctx.saved = (values.detach(), octree, o, d, bg, eps)
-        return torch.from_numpy(rgb), torch.from_numpy(trans), torch.from_numpy(depth)
-
-    @staticmethod
-    def backward(ctx, d_rgb, d_trans, d_depth):
-        values, octree, o, d, bg, eps = ctx.saved
-        gradient = torch.zeros_like(values)
-        slots = np.full(octree.n_vertices, -1, np.int32)
-        cotangents = (g.contiguous().numpy() for g in (d_rgb, d_trans, d_depth))
-        native().render_backward(_tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots)
-        return gradient, None, None, None, None, None
-
-
-def render_values(
-    octree: Octree,
-    values: Tensor,
-    rays_o,
-    rays_d,
-    background: Sequence[float] = WHITE,
-    early_stop_eps: float = 0.0,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Differentiable rendering with vertex rows ``values`` (n_vertices, row) in place of the octree's own.
-
-    Returns rgb (n, 3), transmittance (n,), expected distance (n,); gradients flow to ``values``. float64 values run on
-    the reference, float32 on the compiled kernels where they exist.
-    """
-    if values.shape != octree.values.shape:
-        raise ValueError(f"values must have the octree's shape {octree.values.shape}, got {tuple(values.shape)}")
-    bg, early_stop_eps = _check_background(background), _check_early_stop(early_stop_eps)
-    if values.dtype == torch.float32 and native() is not None:
-        o, d = _check_rays(rays_o, rays_d)
-        return _Render.apply(values.contiguous(), octree, o, d, bg, float(early_stop_eps))
-    directions = torch.as_tensor(np.asarray(rays_d)).to(values.dtype)
-    origins = _per_ray(rays_o, len(directions)).to(values.dtype)
-    return reference.render(octree, values, origins, directions, torch.tensor(bg, dtype=values.dtype), early_stop_eps)
+    return tiles.swapaxes(1, 2).reshape(8 * down, 8 * across, *rows.shape[1:])
 
 
 # ------------------------------------------------------------------ training
-def _check_batch(batch: Batch, options: LossOptions) -> tuple[np.ndarray, np.ndarray, list[float], float]:
-    o, d = _check_rays(batch.rays_o, batch.rays_d)
+def check_batch(batch: Batch, options: LossOptions) -> tuple[np.ndarray, np.ndarray, list[float], float]:
+    o, d = check_rays(batch.rays_o, batch.rays_d)
     if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
         raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")
-    return o, d, _check_background(options.background), _check_early_stop(options.early_stop_eps)
+    return o, d, check_background(options.background), check_early_stop(options.early_stop_eps)
 
 
 def train_step(
@@ -274,12 +223,12 @@ def train_step(
 
     Bitwise the same for any number of threads.
     """
-    o, d, bg, eps = _check_batch(batch, options)
+    o, d, bg, eps = check_batch(batch, options)
     state.check(octree)
     if (compiled := native()) is None:
-        return _train_step_reference(octree, state, batch, options, rates, pixel_angle)
+        return _on_torch().train_step(octree, state, batch, options, rates, pixel_angle)
     squared, weight, samples = compiled.train_step(
-        _tree(octree, octree.values),
+        kernel_tree(octree, octree.values),
         o,
         d,
         batch.target,
@@ -303,65 +252,3 @@ def train_step(
     return StepReport(squared / max(3 * weight, 1e-30), samples / max(len(d), 1))
 
 
-def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOptions) -> Tensor:
-    """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled."""
-    o, d, bg, eps = _check_batch(batch, options)
-    if values.dtype == torch.float32 and (compiled := native()) is not None:
-        gradient = torch.zeros_like(values)
-        slots = np.full(octree.n_vertices, -1, np.int32)
-        tree = _tree(octree, values.detach().contiguous().numpy())
-        loss = (bg, eps, float(options.colour), float(options.distortion), 1.0)
-        no_optimiser = (None, None, [0.0, 0.0, 0.0], 0.0, 0.0)
-        no_statistics = (None, None, None)
-        compiled.train_step(
-            tree, o, d, batch.target, batch.weight, *loss, gradient.numpy(), *no_optimiser, slots, *no_statistics
-        )
-        return gradient
-    leaf = values.detach().clone().requires_grad_()
-    total, _ = _reference_loss(octree, leaf, batch, options)
-    return torch.autograd.grad(total, leaf)[0]
-
-
-def _reference_loss(octree: Octree, values: Tensor, batch: Batch, options: LossOptions):
-    live = torch.from_numpy(batch.weight > 0)
-    to = lambda a: torch.as_tensor(np.asarray(a)).to(values.dtype)  # noqa: E731
-    origins, directions = _per_ray(batch.rays_o, len(batch.rays_d)), to(batch.rays_d)
-    total, report = reference.loss(
-        octree, values, to(origins)[live], directions[live], to(batch.target)[live], to(batch.weight)[live], options
-    )
-    report["live"] = live
-    return total, report
-
-
-def _train_step_reference(octree: Octree, state: TrainState, batch: Batch, options, rates: Rates, pixel_angle: float):
-    values = torch.from_numpy(octree.values)
-    leaf = values.clone().requires_grad_()
-    total, report = _reference_loss(octree, leaf, batch, options)
-    gradient = torch.autograd.grad(total, leaf)[0]
-    samples: reference.Samples = report["samples"]
-    seg = samples.segments
-    with torch.no_grad():
-        touched = torch.from_numpy(octree.corners).long()[seg.leaf].flatten().unique()
-        g, moments = gradient[touched], torch.from_numpy(state.moments)
-        old = moments[touched]
-        new = torch.where(old > 0, rates.beta * old + (1 - rates.beta) * g * g, g * g)
-        moments[touched] = new
-        values[touched] -= _rate_row(octree, rates) * g / (new.sqrt() + rates.eps)
-
-        weight = torch.from_numpy(batch.weight)[report["live"]]
-        max_weight, footprint = torch.from_numpy(state.max_weight), torch.from_numpy(state.footprint)
-        max_weight.scatter_reduce_(0, seg.leaf, samples.weights.detach(), "amax")
-        error = samples.weights.detach() * (weight * report["squared_error"])[seg.ray]
-        torch.from_numpy(state.error).index_add_(0, seg.leaf, error)
-        side = torch.from_numpy(octree.leaf_sizes()).float()[seg.leaf]
-        footprint.scatter_reduce_(0, seg.leaf, side / (samples.middle.clamp_min(1e-6) * pixel_angle), "amax")
-    squared = float((weight * report["squared_error"]).sum())
-    return StepReport(squared / max(3 * float(weight.sum()), 1e-30), len(seg.ray) / max(len(batch.rays_d), 1))
-
-
-def _rate_row(octree: Octree, rates: Rates) -> Tensor:
-    row = torch.full((octree.values.shape[1],), float(rates.sh))
-    row[[0, 4, 8]] = rates.dc
-    row[12] = rates.density
-    row[13:16] = 0
-    return row

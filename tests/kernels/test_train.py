@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfvol.kernels import ops, reference
+from nerfvol.kernels import on_torch, ops, reference
 from nerfvol.octree import Octree, sh_slots
 from tests.kernels import rounding
 from tests.kernels.test_ops import Case, assert_within, build, per_ray, traced
@@ -34,7 +34,7 @@ def batch_of(case: Case) -> ops.Batch:
 @functools.cache
 def true_loss_gradient(case: Case, loss: str) -> np.ndarray:
     octree = build(case)[0]
-    return ops.loss_gradient(octree, torch.from_numpy(octree.values).double(), batch_of(case), LOSSES[loss]).numpy()
+    return on_torch.loss_gradient(octree, torch.from_numpy(octree.values).double(), batch_of(case), LOSSES[loss]).numpy()
 
 
 def loss_bound(case: Case, loss: str) -> np.ndarray:
@@ -67,7 +67,7 @@ def loss_bound(case: Case, loss: str) -> np.ndarray:
 
 def kernel_loss_gradient(case: Case, options: ops.LossOptions) -> np.ndarray:
     octree = build(case)[0]
-    return ops.loss_gradient(octree, torch.from_numpy(octree.values), batch_of(case), options).numpy()
+    return on_torch.loss_gradient(octree, torch.from_numpy(octree.values), batch_of(case), options).numpy()
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -95,10 +95,10 @@ def test_rays_of_weight_zero_are_not_there(isa):
     elsewhere = np.where(blind[:, None], 77.0, batch.target).astype(np.float32)
     other = ops.Batch(batch.rays_o, batch.rays_d, elsewhere, batch.weight)
     values = torch.from_numpy(octree.values)
-    a, b = (ops.loss_gradient(octree, values, x, LOSSES["all"]) for x in (batch, other))
+    a, b = (on_torch.loss_gradient(octree, values, x, LOSSES["all"]) for x in (batch, other))
     assert torch.equal(a, b)
     nothing = ops.Batch(batch.rays_o, batch.rays_d, batch.target, np.zeros_like(batch.weight))
-    assert not ops.loss_gradient(octree, values, nothing, LOSSES["all"]).any()
+    assert not on_torch.loss_gradient(octree, values, nothing, LOSSES["all"]).any()
 
 
 # ------------------------------------------------------------------ the optimiser
@@ -135,7 +135,7 @@ def test_steps_of_the_optimiser(isa, degree):
     touched[octree.corners[traced(case).leaf[batch.weight[traced(case).ray] > 0]]] = True
     for _ in range(3):
         values = torch.from_numpy(octree.values.copy())
-        g = ops.loss_gradient(octree, values, batch, LOSSES["all"]).numpy().astype(float)
+        g = on_torch.loss_gradient(octree, values, batch, LOSSES["all"]).numpy().astype(float)
         before, moments = octree.values.astype(float), state.moments.astype(float)
         ops.train_step(octree, state, batch, LOSSES["all"], RATES, PIXEL_ANGLE)
         m = np.where(moments > 0, RATES.beta * moments + (1 - RATES.beta) * g * g, g * g)
@@ -209,7 +209,7 @@ def test_training_descends(isa):
     goal, o, d = build(case)
     octree = copy_of(goal)
     octree.density, octree.sh = -1.0, 0.0
-    target = ops.render_rays(goal, o, d, BACKGROUND, 0.0)["rgb"].numpy()
+    target = ops.render_rays(goal, o, d, BACKGROUND, 0.0)["rgb"]
     batch = ops.Batch(o, d, target, np.full(len(d), 1 / len(d), np.float32))
     state, options = ops.TrainState(octree), ops.LossOptions(BACKGROUND)
     errors = [ops.train_step(octree, state, batch, options, RATES, PIXEL_ANGLE).squared_error for _ in range(60)]
