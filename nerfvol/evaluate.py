@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from nerfvol import __version__, pictures, runs
 from nerfvol.cameras import Camera
 from nerfvol.datasets import Dataset, load_dataset
+from nerfvol.datasets.images import map_threads
 from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder, write_json
 from nerfvol.kernels import ops
@@ -43,21 +44,28 @@ def score_views(
     seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair.
     """
     rows = []
-    for index, camera in enumerate(dataset.cameras):
-        started = time.perf_counter()
-        image = render(camera)
-        seconds = time.perf_counter() - started
-        image = np.clip(image, 0.0, 1.0)
-        truth = dataset.composited(index, background)
-        row = {
-            "name": dataset.names[index],
-            "psnr": min(psnr(image, truth), LARGEST_PSNR),
-            "ssim": ssim(image, truth),
-            "seconds": seconds,
-        }
-        rows.append(row)
+    indices, at_once = range(len(dataset)), ops.get_threads()
+    for some in (indices[first : first + at_once] for first in range(0, len(dataset), at_once)):
+        # A few views one after the other, for their times; then their scores side by side.
+        images = {}
+        for index in some:
+            started = time.perf_counter()
+            image = render(dataset.cameras[index])
+            images[index] = np.clip(image, 0.0, 1.0), time.perf_counter() - started
+
+        def score(index: int, images: Mapping[int, tuple[Float, float]] = images) -> dict[str, Any]:
+            truth, (image, seconds) = dataset.composited(index, background), images[index]
+            return {
+                "name": dataset.names[index],
+                "psnr": min(psnr(image, truth), LARGEST_PSNR),
+                "ssim": ssim(image, truth),
+                "seconds": seconds,
+            }
+
+        rows += map_threads(score, some, at_once)
         if on_view is not None:
-            on_view(index, truth, image)
+            for index in some:
+                on_view(index, dataset.composited(index, background), images[index][0])
     return {
         "psnr": statistics.fmean(row["psnr"] for row in rows),
         "ssim": statistics.fmean(row["ssim"] for row in rows),

@@ -27,6 +27,7 @@ from nerfvol.datasets import Dataset, load_dataset
 from nerfvol.datasets.images import composite_average
 from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder
+from nerfvol.kernels import ops
 from nerfvol.machine import process_seconds
 from nerfvol.memory import affordable_leaves, estimate_training, largest_octree
 from nerfvol.metrics import ssim
@@ -35,6 +36,10 @@ FIELD_SHARE = 0.3
 """Of a time budget, the most that the field gets."""
 RESERVE_SHARE = 0.2
 """Of a time budget, the most that is kept for writing and scoring."""
+FINISH_SECONDS = 0.5
+"""Of writing, beside ..."""
+FINISH_SECONDS_PER_LEAF = 1.5e-6
+"""... writing and reading an octree in compact storage (two cores of 2023); a run that takes longer ends later."""
 LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
 RUNNING = 0.98
@@ -63,6 +68,11 @@ class Phase(Protocol):
 
     def picture(self, camera: Camera) -> np.ndarray:
         """(H, W, 3) as the camera sees it."""
+        ...
+
+    @property
+    def n_leaves(self) -> int:
+        """Of the octree that there is so far."""
         ...
 
     def size(self) -> str:
@@ -196,10 +206,19 @@ class Run:
             "trainer": phase.trainer.state_dict(),
         }  # fmt: skip
         save_checkpoint(self.checkpoint, state)
+        self.release_images(phase)
+        self._last_save = time.perf_counter()
+
+    def enter_stage(self, phase: Phase) -> None:
+        """What a change of the phase's stage brings: images that are needed no more, another time to finish."""
+        self.release_images(phase)
+        self._reserve = self._time_to_finish(phase)
+
+    def release_images(self, phase: Phase) -> None:
+        """Let go of the training images once the tiles at hand serve to the end."""
         left = self.config.octree.downscales[phase.stage :]
         if phase.name == "octree" and phase.trainer.bank is not None and len(set(left)) == 1:
-            self.dataset.release()  # the tiles at hand serve to the end
-        self._last_save = time.perf_counter()
+            self.dataset.release()
 
     def preview(self, phase: Phase, moment: float) -> None:
         """The first held-out view, small: truth beside what the phase has."""
@@ -208,8 +227,6 @@ class Run:
         truth = composite_average(image, self.config.background, k).astype(np.float32) / 255
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
         pictures.write_png(self.preview_folder / f"{phase.name}_{round(100 * moment):03d}.png", picture)
-        if phase.name == "octree" and 0.2 < moment < 1:
-            self._reserve = self._time_to_finish(phase)
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
@@ -248,17 +265,20 @@ class Run:
         return {"provenance": provenance, "background": list(config.background), "orbit": orbit}
 
     def _time_to_finish(self, phase: Phase | None = None) -> float:
-        """Seconds to keep for writing and scoring, by doing it for one view; rendering is guessed without a phase."""
+        """Seconds to keep for writing and scoring: scoring measured on one view; without a phase, the rest is guessed."""
         if self.config.time_budget is None:
             return 0.0
         started = time.perf_counter()
         image = self.held_out.composited(0, self.config.background)
         ssim(image, image)
+        scoring = (time.perf_counter() - started) / ops.get_threads()  # so many views are scored side by side
+        started = time.perf_counter()
         if phase is not None:
             phase.picture(self.held_out.cameras[0])
-        view = time.perf_counter() - started + (0.15e-6 * image.size / 3 if phase is None else 0.0)
+        rendering = 0.1e-6 * image.size / 3 if phase is None else time.perf_counter() - started
         views = len(self.held_out) + (self.config.compare_views if self.stages else 0)
-        return min(2.0 + 1.1 * views * view, RESERVE_SHARE * self.config.time_budget)
+        writing = FINISH_SECONDS + FINISH_SECONDS_PER_LEAF * (1_000_000 if phase is None else phase.n_leaves)
+        return min(writing + 1.1 * views * (scoring + rendering), RESERVE_SHARE * self.config.time_budget)
 
 
 def require_something(dataset: Dataset, background: Sequence[float]) -> None:

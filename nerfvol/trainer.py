@@ -4,8 +4,8 @@ Without a time budget a run is a fixed number of steps and no clock is read for 
 checkpoints: the same seed gives the same bits, for any number of threads, stopped and resumed or not. With a budget,
 progress is the share of the time that is over, and every stage ends with the best it has.
 
-A checkpoint holds all that lives between two steps. It is written at each change of stage, every
-``config.checkpoint_every`` seconds and on Ctrl-C, under a temporary name: kill -9 costs at most that interval.
+A checkpoint holds all that lives between two steps. It is written every ``config.checkpoint_every`` seconds and on
+Ctrl-C, under a temporary name: kill -9 costs at most that interval.
 """
 
 from __future__ import annotations
@@ -90,7 +90,9 @@ def optimise(run: Run, phase: FieldPhase | OctreePhase) -> None:
             if run.interrupted:
                 run.save(phase)
                 raise run.interruption(phase)
-            if phase.stage != stage or run.checkpoint_due():
+            if phase.stage != stage:
+                run.enter_stage(phase)
+            if run.checkpoint_due():
                 run.save(phase)
     if phase.stages_left:
         print(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
@@ -155,7 +157,7 @@ class FieldPhase:
     name = "field"
     previews = (0.1, 0.4, 1.0)
     preview_width = 100  # a field renders slowly
-    stages_left = 0
+    stages_left = n_leaves = 0
 
     def __init__(self, run: Run) -> None:
         from nerfvol.train_field import FieldTrainer
@@ -224,8 +226,12 @@ class OctreePhase:
         """(H, W, 3) as the camera sees the octree."""
         return render_image(self.trainer.octree, camera, self.background, outputs=("rgb",))["rgb"]
 
+    @property
+    def n_leaves(self) -> int:
+        return self.trainer.octree.n_leaves
+
     def size(self) -> str:
-        return f"{self.trainer.octree.n_leaves:,} leaves"
+        return f"{self.n_leaves:,} leaves"
 
 
 # ------------------------------------------------------------------ small things

@@ -237,6 +237,7 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     """More steps than fit: by a clock that goes on 20 ms at every look, each phase gets its share and is finished."""
     looks = iter(range(10**9))
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 0.02 * next(looks))
+    monkeypatch.setattr(session, "FINISH_SECONDS", 100.0)
     config = settings(tiny_scene, tmp_path, init=init, time_budget=10.0, checkpoint_every=1000)
     config.octree.steps = config.field.steps = 10**9
     start(config)

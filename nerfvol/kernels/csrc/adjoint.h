@@ -2,6 +2,7 @@
 #pragma once
 #include <algorithm>
 #include <memory>
+#include <new>
 
 #include "render.h"
 
@@ -11,18 +12,9 @@ using nerfvol::Cotangents;
 using nerfvol::Loss;
 using nerfvol::StepReport;
 
-// Gradient of the loss in the field at one hit: what phase 2 needs, and no more, since it crosses from cache to cache.
-struct PointGradient {
-    f4 value;                             // dL/d(r, g, b, raw density)
-    float fx, fy, fz;                     // place in the leaf
-    int32_t lane;
-};
-
-// The packet in work: hits front to back, the leaves they lie in, their gradients. Reused by a thread, so that it stays in
-// its cache.
+// The packet in work: hits front to back and the leaves they lie in. Reused by a thread, so that it stays in its cache.
 struct Workspace {
     std::unique_ptr<Hit[]> hits;
-    std::unique_ptr<PointGradient[]> points;
     std::vector<Visit> visits;
     std::vector<int32_t> first_hit;       // of each visit
     size_t size = 0, capacity = 0;
@@ -33,11 +25,73 @@ struct Workspace {
             std::unique_ptr<Hit[]> larger(new Hit[capacity]);
             std::copy(hits.get(), hits.get() + size, larger.get());
             hits = std::move(larger);
-            points.reset(new PointGradient[capacity]);
         }
         size += n;
         return hits.get() + size - n;
     }
+};
+
+// Gradients of vertices: one row each, in the order of the first touch, each on cache lines of its own.
+class VertexGradients {
+public:
+    // Forgets all and makes room for n vertices of row_floats each.
+    void start(size_t n, size_t row_floats) {
+        row_floats_ = row_floats;
+        vertices.clear();
+        vertices.reserve(n);
+        if (n * row_floats > capacity_) {
+            capacity_ = n * row_floats * 5 / 4;
+            rows_.reset(new (std::align_val_t{64}) float[capacity_]);
+        }
+    }
+    float* row(size_t i) { return rows_.get() + i * row_floats_; }
+    const float* row(size_t i) const { return rows_.get() + i * row_floats_; }
+    float* append(int32_t vertex) {  // the row is not set
+        vertices.push_back(vertex);
+        return row(vertices.size() - 1);
+    }
+
+    std::vector<int32_t> vertices;
+
+private:
+    struct Free {
+        void operator()(float* p) const { ::operator delete[](p, std::align_val_t{64}); }
+    };
+    std::unique_ptr<float[], Free> rows_;
+    size_t capacity_ = 0, row_floats_ = 0;
+};
+
+// Where each vertex stands in VertexGradients: open addressing, at most an eighth full since corners are shared.
+class VertexTable {
+public:
+    void start(size_t n) {  // n: an upper bound of the vertices
+        bits_ = 6;
+        while ((size_t(1) << bits_) <= n) ++bits_;
+        entries_.assign(size_t(1) << bits_, {-1, 0});
+    }
+    template <int B> void add(int32_t vertex, const f16 (&gradient)[B], VertexGradients& gradients) {
+        const size_t mask = entries_.size() - 1;
+        for (size_t at = (uint32_t(vertex) * 2654435769u) >> (32 - bits_);; at = (at + 1) & mask) {
+            Entry& e = entries_[at];
+            if (e.vertex == vertex) {
+                float* row = gradients.row(size_t(e.place));
+                for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(row + 16 * k) + gradient[k]);
+                return;
+            }
+            if (e.vertex >= 0) continue;
+            e = {vertex, int32_t(gradients.vertices.size())};
+            float* row = gradients.append(vertex);
+            for (int k = 0; k < B; ++k) store(row + 16 * k, gradient[k]);
+            return;
+        }
+    }
+
+private:
+    struct Entry {
+        int32_t vertex, place;
+    };
+    std::vector<Entry> entries_;
+    int bits_ = 0;
 };
 
 template <int B>
@@ -134,13 +188,18 @@ inline void adjoint_of_loss(const Loss& loss, const PacketState& s, int64_t firs
     }
 }
 
-// Back to front: dL/d(r, g, b, raw density) of each hit.
-inline void backward_packet(Workspace& work, Adjoint& a, float per_length) {
+// Back to front: dL/d(r, g, b, raw density) of each hit, added to the rows of its leaf's corners.
+template <int B>
+void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& work, Adjoint& a, VertexTable& table,
+                     VertexGradients& gradients) {
+    const float per_length = 1.0f / tree.size;
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
+    gradients.start(8 * work.visits.size(), 16 * B);
+    table.start(8 * work.visits.size());
     for (size_t v = work.visits.size(); v-- > 0;) {
         Visit& visit = work.visits[v];
         const Hit* h = work.hits.get() + work.first_hit[v];
-        PointGradient* point = work.points.get() + work.first_hit[v];
+        f16 corner[8][B] = {};
         for (int i = 0; i < visit.n_hits; ++i) {
             const int l = h[i].lane;
             const float w = h[i].weight;
@@ -166,9 +225,22 @@ inline void backward_packet(Workspace& work, Adjoint& a, float per_length) {
             }
             gradient[3] = (h[i].trans_after * q - a.behind[l]) * h[i].tau_slope;
             a.behind[l] += w * q;
-            point[i] = {gradient, h[i].fx, h[i].fy, h[i].fz, h[i].lane};
             visit.error += w * a.error[l];
+
+            alignas(32) float share[8];
+            store(share, trilinear(h[i].fx, h[i].fy, h[i].fz));
+            keep_in_memory(share);
+            const f16 g = __builtin_shufflevector(gradient, gradient, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+            for (int k = 0; k < B; ++k) {
+                f16 gk = g;
+                if (B == 2 && k == 1)
+                    gk = __builtin_shufflevector(gradient, gradient, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 3);
+                gk *= load<f16>(basis.row[l] + 16 * k);
+                for (int o = 0; o < 8; ++o) corner[o][k] += share[o] * gk;
+            }
         }
+        const int32_t* corners = tree.corners + 8 * int64_t(visit.leaf);
+        for (int o = 0; o < 8; ++o) table.add(corners[o], corner[o], gradients);
     }
 }
 

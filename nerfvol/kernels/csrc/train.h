@@ -1,10 +1,9 @@
 // Forward and adjoint over a batch of tiles, then the gradient's sum per vertex and the optimiser.
 //
-// Two phases, both parallel, neither with atomics. Phase 1 works tile by tile and leaves, for each hit, four numbers: the
-// gradient of the field at that point. Phase 2 works range of vertices by range of vertices ("bucket"): one thread adds up
-// all hits that touch its range in the order of the batch and applies the optimiser on the spot, while the sums lie in its
-// own cache. The order of every sum is fixed by the batch, so the result is the same to the last bit for any number of
-// threads.
+// Two phases, both parallel, neither with atomics. Phase 1 works tile by tile and leaves one row of gradients for each
+// vertex that the tile touches. Phase 2 works range of vertices by range of vertices ("bucket"): one thread adds up the
+// rows of its range in the order of the batch and applies the optimiser on the spot, while the sums lie in its own cache.
+// The order of every sum is fixed by the batch, so the result is the same to the last bit for any number of threads.
 #pragma once
 #include <algorithm>
 #include <memory>
@@ -19,21 +18,15 @@ using nerfvol::kBuckets;
 using nerfvol::LeafStatistics;
 using nerfvol::Optimizer;
 
-// A visited leaf, for phase 2. Self-contained, so that phase 2 reads records in a row and nothing else of phase 1's.
-struct LeafGradient {
-    int32_t corners[8];
-    int32_t leaf, n_points;
-    float max_weight, error, near, side;
-};
-
-// What phase 1 leaves of one packet, grouped by bucket: a leaf whose corners lie in several stands in several groups. Kept
-// between steps to spare the allocations.
+// What phase 1 leaves of one packet. Kept between steps to spare the allocations.
 struct PacketRecord {
-    std::vector<LeafGradient> leaves;
-    std::unique_ptr<PointGradient[]> points;
-    size_t capacity = 0;
-    int32_t first_leaf[kBuckets + 1], first_point[kBuckets + 1];
-    alignas(64) float basis[kTile * 64];  // rows of BasisRows, 16 * B floats each
+    struct Row {
+        int32_t vertex, at;
+    };
+    VertexGradients gradients;
+    std::vector<Row> order;               // of the gradients' rows: by bucket, and as they were met within each
+    std::vector<Visit> visits;            // by the bucket of the leaf's first corner
+    int32_t first_row[kBuckets + 1], first_visit[kBuckets + 1];
     StepReport report;
 };
 
@@ -43,117 +36,72 @@ inline int bucket_shift(int64_t n_vertices) {
     return shift;
 }
 
-// Copies visits and their gradients into the record, bucket by bucket, in the order of the walk within each.
-inline void group_by_bucket(const Tree& tree, int shift, const Workspace& work, PacketRecord& rec) {
-    std::memset(rec.first_leaf, 0, sizeof(rec.first_leaf));
-    std::memset(rec.first_point, 0, sizeof(rec.first_point));
-    const size_t n = work.visits.size();
-    const auto distinct_buckets = [&](const int32_t* corners, int32_t* out) {
-        int m = 0;
-        for (int o = 0; o < 8; ++o) {
-            const int32_t b = corners[o] >> shift;
-            bool known = false;
-            for (int j = 0; j < m; ++j) known |= out[j] == b;
-            if (!known) out[m++] = b;
-        }
-        return m;
-    };
-    int32_t b[8];
-    for (size_t v = 0; v < n; ++v)
-        for (int j = distinct_buckets(tree.corners + 8 * int64_t(work.visits[v].leaf), b); j-- > 0;) {
-            ++rec.first_leaf[b[j] + 1];
-            rec.first_point[b[j] + 1] += work.visits[v].n_hits;
-        }
-    for (int k = 0; k < kBuckets; ++k) {
-        rec.first_leaf[k + 1] += rec.first_leaf[k];
-        rec.first_point[k + 1] += rec.first_point[k];
-    }
-    rec.leaves.resize(size_t(rec.first_leaf[kBuckets]));
-    if (size_t(rec.first_point[kBuckets]) > rec.capacity) {
-        rec.capacity = size_t(rec.first_point[kBuckets]) * 5 / 4;
-        rec.points.reset(new PointGradient[rec.capacity]);
-    }
-    int32_t leaf_at[kBuckets], point_at[kBuckets];
-    std::memcpy(leaf_at, rec.first_leaf, sizeof(leaf_at));
-    std::memcpy(point_at, rec.first_point, sizeof(point_at));
-    for (size_t v = 0; v < n; ++v) {
-        const Visit& visit = work.visits[v];
-        const int32_t* corners = tree.corners + 8 * int64_t(visit.leaf);
-        LeafGradient out = {{}, visit.leaf, visit.n_hits, visit.max_weight, visit.error, visit.near, visit.side};
-        std::memcpy(out.corners, corners, sizeof(out.corners));
-        const PointGradient* points = work.points.get() + work.first_hit[v];
-        const int m = distinct_buckets(corners, b);
-        for (int j = 0; j < m; ++j) {
-            rec.leaves[size_t(leaf_at[b[j]]++)] = out;
-            std::copy(points, points + visit.n_hits, rec.points.get() + point_at[b[j]]);
-            point_at[b[j]] += visit.n_hits;
-        }
-    }
+// Stable counting sort of n items into buckets: first[b] is where bucket b begins; place(from, to) moves one.
+template <class BucketOf, class Place> void sort_by_bucket(size_t n, int32_t* first, BucketOf bucket_of, Place place) {
+    std::memset(first, 0, (kBuckets + 1) * sizeof(int32_t));
+    for (size_t i = 0; i < n; ++i) ++first[bucket_of(i) + 1];
+    for (int b = 0; b < kBuckets; ++b) first[b + 1] += first[b];
+    int32_t at[kBuckets];
+    std::memcpy(at, first, sizeof(at));
+    for (size_t i = 0; i < n; ++i) place(i, size_t(at[bucket_of(i)]++));
 }
 
-// Gradient sums of the vertices in one bucket.
-template <int B> struct Sums {
-    std::vector<float> rows;
-    std::vector<int32_t> touched;
+inline void group_by_bucket(const Tree& tree, int shift, const Workspace& work, bool with_visits, PacketRecord& rec) {
+    const std::vector<int32_t>& vertices = rec.gradients.vertices;
+    rec.order.resize(vertices.size());
+    sort_by_bucket(vertices.size(), rec.first_row, [&](size_t i) { return vertices[i] >> shift; },
+                   [&](size_t i, size_t to) { rec.order[to] = {vertices[i], int32_t(i)}; });
+    const std::vector<Visit>& visits = work.visits;
+    rec.visits.resize(with_visits ? visits.size() : 0);
+    sort_by_bucket(rec.visits.size(), rec.first_visit, [&](size_t i) { return tree.corners[8 * int64_t(visits[i].leaf)] >> shift; },
+                   [&](size_t i, size_t to) { rec.visits[to] = visits[i]; });
+}
 
-    float* row(int32_t vertex, int32_t* slots) {
-        int32_t& slot = slots[vertex];
+// Adds a packet's gradients of the vertices in one bucket to the bucket's sums; slots has the place of each vertex there.
+template <int B> void add_rows(const PacketRecord& rec, int bucket, int32_t* slots, VertexGradients& sums) {
+    for (int32_t i = rec.first_row[bucket]; i < rec.first_row[bucket + 1]; ++i) {
+        const PacketRecord::Row& entry = rec.order[size_t(i)];
+        const float* row = rec.gradients.row(size_t(entry.at));
+        int32_t& slot = slots[entry.vertex];
         if (slot < 0) {
-            slot = int32_t(touched.size());
-            touched.push_back(vertex);
-            rows.resize(rows.size() + 16 * B, 0.0f);
+            slot = int32_t(sums.vertices.size());
+            float* sum = sums.append(entry.vertex);
+            for (int k = 0; k < B; ++k) store(sum + 16 * k, load<f16>(row + 16 * k));
+        } else {
+            float* sum = sums.row(size_t(slot));
+            for (int k = 0; k < B; ++k) store(sum + 16 * k, load<f16>(sum + 16 * k) + load<f16>(row + 16 * k));
         }
-        return rows.data() + size_t(slot) * 16 * B;
-    }
-};
-
-template <int B>
-void add_leaf(const LeafGradient& leaf, const PointGradient* h, const float* basis_rows, int bucket, int shift, int32_t* slots,
-              Sums<B>& sums) {
-    f16 corner[8][B];
-    for (int o = 0; o < 8; ++o)
-        for (int k = 0; k < B; ++k) corner[o][k] = f16{};
-    for (int i = 0; i < leaf.n_points; ++i) {
-        alignas(32) float w[8];
-        store(w, trilinear(h[i].fx, h[i].fy, h[i].fz));
-        keep_in_memory(w);
-        const f4 v4 = h[i].value;
-        const f16 g = __builtin_shufflevector(v4, v4, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
-        const float* basis = basis_rows + 16 * B * h[i].lane;
-        for (int k = 0; k < B; ++k) {
-            f16 b = load<f16>(basis + 16 * k);
-            f16 gk = g;
-            if (B == 2 && k == 1) gk = __builtin_shufflevector(v4, v4, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 3);
-            gk *= b;
-            for (int o = 0; o < 8; ++o) corner[o][k] += w[o] * gk;
-        }
-    }
-    for (int o = 0; o < 8; ++o) {
-        if (leaf.corners[o] >> shift != bucket) continue;
-        float* row = sums.row(leaf.corners[o], slots);
-        for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(row + 16 * k) + corner[o][k]);
     }
 }
 
-template <int B> void apply(const GradientSink& sink, Sums<B>& sums) {
-    const int n = int(sums.touched.size());
+// Asks for what add_rows will read; the order of the rows was asked for before.
+inline void prefetch_rows(const PacketRecord& rec, int bucket, const int32_t* slots) {
+    for (int32_t i = rec.first_row[bucket]; i < rec.first_row[bucket + 1]; ++i) {
+        const PacketRecord::Row& entry = rec.order[size_t(i)];
+        __builtin_prefetch(rec.gradients.row(size_t(entry.at)));
+        __builtin_prefetch(slots + entry.vertex, 1);
+    }
+}
+
+template <int B> void apply(const GradientSink& sink, const VertexGradients& sums) {
+    const size_t n = sums.vertices.size();
     const float dc = sink.optimizer ? sink.optimizer->rate_dc : 0, sh = sink.optimizer ? sink.optimizer->rate_sh : 0;
     const float density = sink.optimizer ? sink.optimizer->rate_density : 0;
     f16 rate[B];
     for (int k = 0; k < B; ++k) rate[k] = splat16(sh);
     rate[0] = f16{dc, sh, sh, sh, dc, sh, sh, sh, dc, sh, sh, sh, density, 0, 0, 0};
-    for (int i = 0; i < n; ++i) {
-        const int32_t vertex = sums.touched[size_t(i)];
+    for (size_t i = 0; i < n; ++i) {
+        const int32_t vertex = sums.vertices[i];
         const int64_t at = 16 * B * int64_t(vertex);
         if (sink.optimizer && i + 8 < n) {
-            const int64_t ahead = 16 * B * int64_t(sums.touched[size_t(i) + 8]);
+            const int64_t ahead = 16 * B * int64_t(sums.vertices[i + 8]);
             for (int k = 0; k < B; ++k) {
                 __builtin_prefetch(sink.optimizer->moments + ahead + 16 * k, 1);
                 __builtin_prefetch(sink.optimizer->values + ahead + 16 * k, 1);
             }
         }
         for (int k = 0; k < B; ++k) {
-            const f16 g = load<f16>(sums.rows.data() + 16 * (size_t(i) * B + size_t(k)));
+            const f16 g = load<f16>(sums.row(i) + 16 * k);
             if (sink.gradient) {
                 store(sink.gradient + at + 16 * k, load<f16>(sink.gradient + at + 16 * k) + g);
                 continue;
@@ -171,11 +119,9 @@ template <int B> void apply(const GradientSink& sink, Sums<B>& sums) {
         }
         sink.slots[vertex] = -1;
     }
-    sums.touched.clear();
-    sums.rows.clear();
 }
 
-inline void add_statistics(const LeafGradient& leaf, const LeafStatistics& out, float pixel_angle) {
+inline void add_statistics(const Visit& leaf, const LeafStatistics& out, float pixel_angle) {
     float& w = out.max_weight[leaf.leaf];
     w = std::max(w, leaf.max_weight);
     out.error[leaf.leaf] += leaf.error;
@@ -215,7 +161,6 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         if (loss) bound_packet(p);
         BasisRows<B> basis;
         basis.fill(p, tree.sh_degree);
-        for (int l = 0; l < count; ++l) std::memcpy(rec.basis + 16 * B * l, basis.row[l], sizeof(basis.row[l]));
         PacketState state;
         static thread_local Workspace workspace;
         Workspace& work = workspace;
@@ -224,22 +169,22 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         rec.report = {0, 0, double(work.size)};
         if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
         else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
-        backward_packet(work, adjoint, 1.0f / tree.size);
-        group_by_bucket(tree, shift, work, rec);
+        static thread_local VertexTable table;
+        backward_packet<B>(tree, basis, work, adjoint, table, rec.gradients);
+        group_by_bucket(tree, shift, work, statistics.max_weight != nullptr, rec);
     });
 
     nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
-        static thread_local Sums<B> per_thread;
-        Sums<B>& sums = per_thread;
+        static thread_local VertexGradients per_thread;
+        VertexGradients& sums = per_thread;
+        sums.start(size_t(1) << shift, 16 * B);
         for (int i = 0; i < n; ++i) {
             const PacketRecord& rec = *records[size_t(i)];
-            const PointGradient* points = rec.points.get() + rec.first_point[bucket];
-            for (int32_t k = rec.first_leaf[bucket]; k < rec.first_leaf[bucket + 1]; ++k) {
-                const LeafGradient& leaf = rec.leaves[size_t(k)];
-                add_leaf<B>(leaf, points, rec.basis, bucket, shift, sink.slots, sums);
-                points += leaf.n_points;
-                if (statistics.max_weight && leaf.corners[0] >> shift == bucket) add_statistics(leaf, statistics, pixel_angle);
-            }
+            if (i + 2 < n) __builtin_prefetch(records[size_t(i + 2)]->order.data() + records[size_t(i + 2)]->first_row[bucket]);
+            if (i + 1 < n) prefetch_rows(*records[size_t(i + 1)], bucket, sink.slots);
+            add_rows<B>(rec, bucket, sink.slots, sums);
+            for (int32_t k = rec.first_visit[bucket]; k < rec.first_visit[bucket + 1]; ++k)
+                add_statistics(rec.visits[size_t(k)], statistics, pixel_angle);
         }
         apply<B>(sink, sums);
     });
