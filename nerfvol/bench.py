@@ -30,6 +30,8 @@ VIEWS = 4
 BASE_SIZE = 800
 TRAIN_TILES = 512
 REFERENCE_RAYS = 2048
+REFERENCE_TILES = 256
+"""Of the training step that both sides make: a whole batch, since plain torch pays for every vertex in each step."""
 PAPER_SAMPLES = (64, 192)
 """Field evaluations a ray costs in the NeRF paper: 64 by the coarse network, 64 + 128 by the fine one."""
 
@@ -129,32 +131,35 @@ def measure_sizes(octree: Octree, cameras: Sequence[Camera], repeats: int) -> li
 
 def training_rate(octree: Octree, cameras: Sequence[Camera], repeats: int) -> tuple[float, float]:
     """Rays a second of forward, backward and optimiser on 8x8 tiles, and segments a ray; ``octree`` stays as it is."""
-    batches = [_batch(octree, camera, seed) for seed, camera in enumerate(cameras)]
-    pixel_angle = 1.0 / cameras[0].intrinsics.fx
-    state = ops.TrainState(octree)
-    loss = ops.LossOptions(WHITE, colour=0.03, distortion=0.01)
-    still = ops.Rates(density=0.0, dc=0.0, sh=0.0)
+    batches = [_batch(octree, camera, seed, TRAIN_TILES) for seed, camera in enumerate(cameras)]
     samples = []
+    train_step = _still(ops.train_step, octree, cameras[0])
 
     def step(index: int) -> None:
-        report = ops.train_step(octree, state, batches[index % len(batches)], loss, still, pixel_angle)
-        samples.append(report.samples)
+        samples.append(train_step(batches[index % len(batches)]).samples)
 
     seconds = median_seconds(step, repeats)
     return len(batches[0].rays_d) / seconds, statistics.median(samples)
 
 
-def _batch(octree: Octree, camera: Camera, seed: int) -> ops.Batch:
+def _still(train_step: Callable[..., ops.StepReport], octree: Octree, camera: Camera) -> Callable[[ops.Batch], ops.StepReport]:
+    """``train_step`` at learning rate zero."""
+    state, loss = ops.TrainState(octree), ops.LossOptions(WHITE, colour=0.03, distortion=0.01)
+    rates, pixel_angle = ops.Rates(density=0.0, dc=0.0, sh=0.0), 1.0 / camera.intrinsics.fx
+    return lambda batch: train_step(octree, state, batch, loss, rates, pixel_angle)
+
+
+def _batch(octree: Octree, camera: Camera, seed: int, n_tiles: int) -> ops.Batch:
     """Random whole tiles of a view that see something, with the octree's own colours, a little off, as the target."""
     lens = camera.intrinsics
     image = render_image(octree, camera, WHITE, DEFAULT_EARLY_STOP, ("rgb", "opacity"))
     tiles = tile_pixels(lens.width, lens.height)
     seen = (tiles >= 0).all(axis=1) & (image["opacity"].reshape(-1)[np.maximum(tiles, 0)].max(axis=1) > 0.01)
     candidates = np.flatnonzero(seen) if seen.any() else np.flatnonzero((tiles >= 0).all(axis=1))
-    chosen = tiles[np.sort(np.random.default_rng(seed).choice(candidates, TRAIN_TILES))].reshape(-1)
+    chosen = tiles[np.sort(np.random.default_rng(seed).choice(candidates, n_tiles))].reshape(-1)
     origin, directions = camera.rays()
     target = np.clip(image["rgb"].reshape(-1, 3)[chosen] * 0.9, 0.0, 1.0)
-    origins = np.broadcast_to(origin, (TRAIN_TILES, 3)).copy()
+    origins = np.broadcast_to(origin, (n_tiles, 3)).copy()
     return ops.Batch(origins, directions[chosen], target, np.ones(len(chosen), np.float32))
 
 
@@ -180,7 +185,7 @@ def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[st
     import torch
 
     from nerfvol.fields import Domain, FieldShape, make_field
-    from nerfvol.kernels import reference
+    from nerfvol.kernels import on_torch, reference
 
     ops.set_threads(ops.get_threads())  # torch was loaded only now
     camera = cameras[0]
@@ -204,6 +209,10 @@ def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[st
         with torch.no_grad():
             field(positions, viewdirs)
 
+    batch = _batch(octree, camera, 0, REFERENCE_TILES)
+    kernel_step, torch_step = (_still(step, octree, camera) for step in (ops.train_step, on_torch.train_step))
+    kernel_seconds = median_seconds(lambda _: kernel_step(batch), 3)
+    torch_seconds = median_seconds(lambda _: torch_step(batch), 3)
     torch_rate = REFERENCE_RAYS / median_seconds(plain, 3)
     mlp_rate = n_rays / median_seconds(network, 3)
     kernel_rate = record["size"][-1]["frames_per_second"] * BASE_SIZE**2
@@ -212,6 +221,10 @@ def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[st
         "torch_rays_per_second": torch_rate,
         "paper_mlp_rays_per_second": mlp_rate,
         "kernel_over_torch": kernel_rate / torch_rate,
+        "train_step_rays": len(batch.rays_d),
+        "kernel_train_step_seconds": kernel_seconds,
+        "torch_train_step_seconds": torch_seconds,
+        "train_step_kernel_over_torch": torch_seconds / kernel_seconds,
         "kernel_over_paper_mlp": kernel_rate / mlp_rate,
     }
 
@@ -240,4 +253,8 @@ def print_tables(record: dict[str, Any]) -> None:
             f"\nrays a second at {BASE_SIZE}²: kernels {r['kernel_rays_per_second']:,.0f}; plain torch "
             f"{r['torch_rays_per_second']:,.0f} ({r['kernel_over_torch']:,.0f} times slower); 8x256 network of the "
             f"NeRF paper {r['paper_mlp_rays_per_second']:,.0f} ({r['kernel_over_paper_mlp']:,.0f} times slower)"
+        )
+        print(
+            f"one training step of {r['train_step_rays']:,} rays: kernels {r['kernel_train_step_seconds'] * 1e3:.1f} ms, "
+            f"plain torch {r['torch_train_step_seconds']:.1f} s ({r['train_step_kernel_over_torch']:,.0f} times slower)"
         )

@@ -21,6 +21,7 @@ import yaml
 
 from nerfvol.errors import InputError
 from nerfvol.files import read_bytes, write_text
+from nerfvol.settings import DistillConfig, FieldConfig
 
 T = TypeVar("T")
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -74,22 +75,10 @@ def positive(value: Any) -> Any:
 Count = Annotated[int, positive]
 
 
-def _field_section() -> Any:
-    from nerfvol.train_field import FieldConfig
-
-    return FieldConfig()
-
-
 def _octree_section() -> Any:
     from nerfvol.finetune import OctreeConfig
 
     return OctreeConfig()
-
-
-def _distill_section() -> Any:
-    from nerfvol.distill import DistillConfig
-
-    return DistillConfig()
 
 
 @dataclass
@@ -119,10 +108,10 @@ class Config:
     """How octree files hold their values: exactly, halved, or quantised to about a tenth (docs/file_format.md)."""
     compare_views: Count = 2
     """Held-out views on which field, distilled and fine-tuned octree are compared (a field renders slowly)."""
-    field: Any = dataclasses.field(default_factory=_field_section)
-    """Section: the MLP field (nerfvol.train_field.FieldConfig)."""
-    distill: Any = dataclasses.field(default_factory=_distill_section)
-    """Section: the field's way into the octree (nerfvol.distill.DistillConfig)."""
+    field: Any = dataclasses.field(default_factory=FieldConfig)
+    """Section: the MLP field (nerfvol.settings.FieldConfig)."""
+    distill: Any = dataclasses.field(default_factory=DistillConfig)
+    """Section: the field's way into the octree (nerfvol.settings.DistillConfig)."""
     octree: Any = dataclasses.field(default_factory=_octree_section)
     """Section: the octree and its optimisation (nerfvol.finetune.OctreeConfig)."""
 

@@ -29,37 +29,11 @@ from nerfvol.merge import merge_smooth
 from nerfvol.metrics import psnr
 from nerfvol.octree import EMPTY_DENSITY, OFFSETS, Octree, explin_inverse
 from nerfvol.render import render_image
+from nerfvol.settings import DistillConfig
 from nerfvol.tiles import TileBank
 
 _CHUNK = 32768  # points of one evaluation of the field
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
-
-
-@dataclasses.dataclass
-class DistillConfig:
-    """How a field is made into an octree."""
-
-    level: int = 8
-    """Finest leaves: 2**level along an edge of the detail cube."""
-    coarse_level: int = 5
-    """Where the search begins; also the coarsest leaves that merging makes in the detail cube."""
-    sh_degree: int = 1
-    density_scale: float = 300.0
-    """Coefficient that a raw density of 1 means, per edge of the detail cube."""
-    empty_opacity: float = 5e-4
-    """A cell is empty where a finest leaf of its largest coefficient would be less opaque than this."""
-    merge_tolerance: float = 0.01
-    """Largest error, in opacity of a leaf and in its colour, that merging may cause; 0 keeps all leaves at one size."""
-    prune_weight: float = 0.005
-    """Leaves whose largest rendering weight over the training rays is below are removed; 0 keeps all."""
-    samples_per_vertex: int = 8
-    """Field samples averaged into a vertex: 1 (the vertex itself) or 8."""
-    max_leaves: int = 4_000_000
-    """Most candidates; ``empty_opacity`` is raised until they fit."""
-    visibility_downscale: int = 4
-    compare_downscale: int = 4
-    compare_views: int = 4
-    """Views, and their size, for the comparison of field and octree."""
 
 
 @dataclasses.dataclass

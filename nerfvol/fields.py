@@ -6,7 +6,7 @@ coordinates; ``sigma`` is in 1/u of the scene; colour is 1/2 + sum_k sh_k Y_k(d)
 """
 
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from nerfvol import sh as spherical
 from nerfvol.encodings import FrequencyEncoding, HashGrid
-from nerfvol.errors import InputError
+from nerfvol.settings import FieldShape
 
 
 @runtime_checkable
@@ -39,51 +39,6 @@ class SHField(RadianceField, Protocol):
     def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """(n, 3) -> sigma (n,), sh (n, 3, (sh_degree + 1)**2)."""
         ...
-
-
-@dataclass(frozen=True)
-class FieldShape:
-    """What a network looks like.
-
-    encoding: "hash" or "frequency".
-    n_frequencies, n_frequencies_dir: L of the frequency encoding, positions and (rgb head) directions.
-    hash_levels, hash_features, hash_log2_table, hash_min, hash_max: see ``encodings.HashGrid``.
-    width, depth: hidden layers of the trunk and their size.
-    skip: index of the hidden layer that sees the encoded position again (0 = none); the paper's is 5 of 8.
-    head: "sh" or "rgb".
-    sh_degree: 0 to 3, for the SH head.
-    density: activation of sigma, "exp" (truncated exponential) or "softplus".
-    density_bias: added to the raw density; negative = the field starts as thin haze.
-    """
-
-    encoding: Literal["hash", "frequency"] = "hash"
-    n_frequencies: int = 10
-    n_frequencies_dir: int = 4
-    hash_levels: int = 8
-    hash_features: int = 2
-    hash_log2_table: int = 17
-    hash_min: int = 16
-    hash_max: int = 256
-    width: int = 64
-    depth: int = 1
-    skip: int = 0
-    head: Literal["sh", "rgb"] = "sh"
-    sh_degree: int = 1
-    density: Literal["exp", "softplus"] = "exp"
-    density_bias: float = -1.0
-
-    def __post_init__(self) -> None:
-        if min(self.width, self.depth) < 1 or not 0 <= self.skip < self.depth:
-            sizes = f"{self.width}, {self.depth}, {self.skip}"
-            raise InputError(f"a field needs width, depth >= 1 and 0 <= skip < depth, got {sizes}")
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"the sh_degree of a field must be 0 to 3, got {self.sh_degree}")
-        if min(self.n_frequencies, self.n_frequencies_dir) < 0:
-            raise InputError("the number of frequencies of an encoding must not be negative")
-        if min(self.hash_levels, self.hash_features, self.hash_min) < 1 or self.hash_max < self.hash_min:
-            raise InputError("a hash grid needs hash_levels, hash_features, hash_min >= 1 and hash_max >= hash_min")
-        if not 4 <= self.hash_log2_table <= 24:
-            raise InputError(f"hash_log2_table must be 4 to 24, got {self.hash_log2_table}")
 
 
 @dataclass(frozen=True)

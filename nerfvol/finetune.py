@@ -25,7 +25,7 @@ from nerfvol.tiles import Cursor, TileBank
 class OctreeConfig:
     """Settings of the octree's optimisation. Shares of progress lie in [0, 1]."""
 
-    steps: int = 12000
+    steps: int = 15000
     """Optimiser steps of the whole schedule when no time budget is given."""
     levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
     """Finest level of each stage: level 8 means 256 cells along the region of detail."""
@@ -33,7 +33,7 @@ class OctreeConfig:
     """Image downscale of each stage."""
     until: list[float] = field(default_factory=lambda: [0.003, 0.008, 0.03, 0.10, 0.35, 0.60, 1.0])
     """Share of progress at which each stage ends."""
-    tiles: list[int] = field(default_factory=lambda: [64, 128, 192, 320, 320, 320, 320])
+    tiles: list[int] = field(default_factory=lambda: [64, 96, 128, 128, 192, 320, 320])
     """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
     prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 2, 2, 2, 2])
     """Prunings inside each stage, evenly spaced."""
@@ -60,15 +60,15 @@ class OctreeConfig:
     beta: float = 0.98
     prune_weight: float = 0.005
     """Leaves whose largest rendering weight since the last pruning is below are removed."""
-    whole_pixels: float = 2.0
+    whole_pixels: float = 2.5
     """Stages split all leaves larger than this many pixels of their images in some view, down to their level, until ..."""
     fine_from: int = 9
     """... this level; from there on a stage splits leaves once, ..."""
     subdivide_pixels: float = 1.0
     """... those larger than this many pixels ..."""
-    subdivide_error: float = 0.8
+    subdivide_error: float = 0.7
     """... that are among the fewest to hold this share of the squared error."""
-    fine_steps: int = 1500
+    fine_steps: int = 3000
     """A stage from level ``fine_from`` on is left out where fewer steps would be left for it."""
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""

@@ -14,6 +14,7 @@ low and a high byte plane, each deflated on its own: the high planes are nearly 
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -62,7 +63,7 @@ def encode(density: Float, sh: Float, quality: float = 1.0) -> tuple[dict[str, B
         return _pack(codes)
 
     # zlib and numpy release the interpreter lock; the result does not depend on the number of threads.
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         packed = list(pool.map(channel, range(1 + 3 * basis_dim)))
     parameters["differences"] = [int(differences) for differences, _ in packed]
     planes = {
@@ -100,7 +101,7 @@ def decode(
         else:
             np.multiply(codes, np.float32(sh_step), out=rotated[index - 1])
 
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(channel, range(n_channels)))
     sh = np.empty((n_vertices, 3, basis_dim), np.float32)
     for k in range(basis_dim):

@@ -28,7 +28,7 @@ from nerfvol.datasets.images import composite_average
 from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder
 from nerfvol.kernels import ops
-from nerfvol.machine import process_seconds
+from nerfvol.machine import process_seconds, return_free_memory
 from nerfvol.memory import affordable_leaves, estimate_training, largest_octree
 from nerfvol.metrics import ssim
 
@@ -212,6 +212,7 @@ class Run:
     def enter_stage(self, phase: Phase) -> None:
         """What a change of the phase's stage brings: images that are needed no more, another time to finish."""
         self.release_images(phase)
+        return_free_memory()
         self._reserve = self._time_to_finish(phase)
 
     def release_images(self, phase: Phase) -> None:

@@ -6,83 +6,24 @@ a run that was stopped and resumed gives the same numbers as one that was not.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain, FieldShape, NeuralField, RadianceField, make_field
+from nerfvol.fields import Domain, NeuralField, RadianceField, make_field
 from nerfvol.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
 from nerfvol.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
+from nerfvol.settings import FieldConfig
 
 if TYPE_CHECKING:
     from nerfvol.cameras import Camera
     from nerfvol.datasets import Dataset, SceneBounds
-
-
-@dataclasses.dataclass
-class FieldConfig:
-    """How a field is trained; the defaults are the best measured for a minute on two cores."""
-
-    shape: FieldShape = dataclasses.field(default_factory=FieldShape)
-    """Section: the network."""
-    steps: int = 1500
-    """Length of the schedule (images, learning rate) where nobody says how far the run has come."""
-    time_budget: float = 75.0
-    """Seconds of wall clock the field gets when it only prepares the octree."""
-    downscales: tuple[int, ...] = (8, 4, 2)
-    """Images are area-averaged by these factors, coarse ones first."""
-    stage_ends: tuple[float, ...] = (0.08, 0.35, 1.0)
-    """Progress in (0, 1] at which each of them ends."""
-    samples_per_step: int = 16384
-    """Samples of one step: the number of rays follows from how many samples a ray has just now."""
-    max_rays: int = 8192
-    """Most rays of one step."""
-    march_steps: tuple[int, ...] = (96, 192, 384)
-    """Marching steps along the diagonal of the detail cube, for each of them."""
-    sampler: Literal["occupancy", "importance"] = "occupancy"
-    """Skip empty space, or stratified coarse samples and inverse-CDF fine samples as the paper does."""
-    n_coarse: int = 64
-    """Stratified samples of a ray with the importance sampler."""
-    n_fine: int = 128
-    """Inverse-CDF samples of a ray with the importance sampler."""
-    grid_resolution: int = 64
-    """Cells along an edge of the occupancy grid."""
-    near_fraction: float = 0.05
-    """Nearest sample to a camera, in units of half the detail cube's edge."""
-    learning_rate: float = 0.01
-    """Adam's, at the start."""
-    final_learning_rate: float = 0.05
-    """Its factor at the end; the decay is exponential and starts at a third of the run."""
-    colour_weight: float = 0.0
-    """Weight of the loss of each sample's own colour, (sum w |c - target|^2 + T |background - target|^2)."""
-    sparsity_weight: float = 0.0
-    """Weight of mean(1 - exp(-sigma * step)) at random points: clears space that nothing constrains."""
-    bfloat16: bool = True
-    """Network arithmetic in bfloat16 while training (2 to 3 times as fast where the processor has it)."""
-
-    def __post_init__(self) -> None:
-        if not len(self.downscales) == len(self.stage_ends) == len(self.march_steps) >= 1:
-            raise InputError(
-                "field.downscales, field.stage_ends and field.march_steps must be lists of the same length"
-            )
-        if min(self.downscales) < 1 or min(self.march_steps) < 8:
-            raise InputError("field.downscales must be at least 1 and field.march_steps at least 8")
-        if list(self.stage_ends) != sorted(self.stage_ends) or self.stage_ends[-1] != 1:
-            raise InputError(f"field.stage_ends must increase and end with 1, got {self.stage_ends}")
-        for name in ("steps", "samples_per_step", "max_rays", "n_coarse", "n_fine"):
-            if getattr(self, name) < 1:
-                raise InputError(f"field.{name} must be at least 1, got {getattr(self, name)}")
-        if self.grid_resolution < 8 or self.grid_resolution % 4:
-            raise InputError(f"field.grid_resolution must be a multiple of 4, at least 8, got {self.grid_resolution}")
-        if not self.learning_rate > 0 or not 0 < self.final_learning_rate <= 1:
-            raise InputError("field.learning_rate must be positive and field.final_learning_rate in (0, 1]")
 
 
 def domain_of(scene: SceneBounds) -> Domain:

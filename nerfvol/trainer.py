@@ -26,7 +26,7 @@ from nerfvol.evaluate import evaluate_octree, score_views
 from nerfvol.files import write_json
 from nerfvol.finetune import OctreeTrainer
 from nerfvol.kernels import ops
-from nerfvol.machine import describe_hardware, peak_memory
+from nerfvol.machine import describe_hardware, peak_memory, return_free_memory
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree, save_octree
 from nerfvol.render import render_image
@@ -55,17 +55,10 @@ def train(config: Config, started: float | None = None) -> Path:
         return out
     run = Run(config, Clock(started, saved["elapsed"] if saved else 0.0), saved)
     with run.interruptible(), run.open_log():
-        octree = None
-        if config.init == "mlp" and run.phase in ("start", "field"):
-            field = FieldPhase(run)
-            optimise(run, field)
-            octree = distil_field(run, field)
-            del field
-        phase = OctreePhase(run, octree)
+        from_field = config.init == "mlp" and run.phase in ("start", "field")
+        phase = OctreePhase(run, start_from_field(run) if from_field else None)
         optimise(run, phase)
-        octree = phase.trainer.octree
-        del phase  # its tiles and moments are not needed for the scores
-        finish(run, octree)
+        finish(run, phase)
     return out
 
 
@@ -98,6 +91,13 @@ def optimise(run: Run, phase: FieldPhase | OctreePhase) -> None:
         print(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
 
 
+def start_from_field(run: Run) -> Octree:
+    """Trains the field and distils it."""
+    phase = FieldPhase(run)
+    optimise(run, phase)
+    return distil_field(run, phase)
+
+
 def distil_field(run: Run, phase: FieldPhase) -> Octree:
     """The field as an octree, with the scores of both; says what was lost."""
     from nerfvol.distill import distill
@@ -124,12 +124,12 @@ def distil_field(run: Run, phase: FieldPhase) -> Octree:
     return octree
 
 
-def finish(run: Run, octree: Octree) -> None:
+def finish(run: Run, phase: OctreePhase) -> None:
     """Writes the octree, scores what was written, writes the scores."""
     config, path = run.config, run.folder / runs.OCTREE
     seconds = run.phase_seconds()
-    written = save_octree(path, octree, run.metadata(), config.storage)
-    del octree
+    written = save_octree(path, phase.take_octree(), run.metadata(), config.storage)
+    return_free_memory()
     stored, _ = load_octree(path)
     scores = evaluate_octree(stored, run.held_out, config.background)
     row = {"seconds": seconds, "steps": run.steps["octree"], "leaves": stored.n_leaves, "MB": written / 1e6}
@@ -225,6 +225,13 @@ class OctreePhase:
     def picture(self, camera: Camera) -> np.ndarray:
         """(H, W, 3) as the camera sees the octree."""
         return render_image(self.trainer.octree, camera, self.background, outputs=("rgb",))["rgb"]
+
+    def take_octree(self) -> Octree:
+        """The octree; tiles, moments and statistics are let go."""
+        octree = self.trainer.octree
+        del self.trainer
+        return_free_memory()
+        return octree
 
     @property
     def n_leaves(self) -> int:

@@ -46,6 +46,7 @@ def test_training_rate_leaves_the_octree_as_it_is(cameras):
 def test_bench_command(tmp_path, command, monkeypatch):
     monkeypatch.setattr(bench, "BASE_SIZE", 48)
     monkeypatch.setattr(bench, "REFERENCE_RAYS", 64)
+    monkeypatch.setattr(bench, "REFERENCE_TILES", 4)
     monkeypatch.setattr(bench, "TRAIN_TILES", 16)
     save_octree(tmp_path / "o.safetensors", make_sphere_octree(5), {})
     code, text, _ = command(
@@ -57,5 +58,5 @@ def test_bench_command(tmp_path, command, monkeypatch):
     assert {row["size"] for row in record["render"]} == {16, 32}
     assert all(row["frames_per_second"] > 0 for row in record["render"])
     assert record["size"][-1]["leaves"] == make_sphere_octree(5).n_leaves
-    assert record["reference"]["kernel_over_paper_mlp"] > 0
+    assert record["reference"]["kernel_over_paper_mlp"] > 0 and record["reference"]["train_step_kernel_over_torch"] > 0
     assert record["file"]["bytes"] == (tmp_path / "o.safetensors").stat().st_size
