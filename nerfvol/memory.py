@@ -16,24 +16,27 @@ from nerfvol.errors import InputError
 from nerfvol.machine import available_memory
 from nerfvol.octree import BLOCKS
 
-BASE_BYTES = 390 << 20
-"""The interpreter with torch and numpy loaded (228 MiB resident, measured), the kernels' buffers of a step, and memory that
-the allocator keeps between changes of the octree (together 160 MiB, measured on lego at its largest octree)."""
+BASE_BYTES = 300 << 20
+"""The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps:
+measured on lego, from 225 MiB at 0.4 million leaves to 350 at 3 million."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
 """Per vertex: a slot (int32), beside two rows of floats."""
-VERTICES_PER_LEAF = 1.32
-"""Vertices of a thin shell of leaves, measured on trained octrees: 1.12 to 1.4 (lego when largest: 1.33)."""
+VERTICES_PER_LEAF = 1.65
+"""Vertices of an octree that was split where it pays, for each leaf: measured on lego, 1.5 to 1.7 at every size."""
 CHANGE_BYTES_PER_LEAF = 59 - 24 + 11 + 84
-"""Per leaf while the largest octree is pruned and nearly all of it stays: the new leaves (59, not yet their statistics
+"""Per leaf while the largest octree is pruned and most of it stays: the new leaves (59, not yet their statistics
 and slots: 24 with the vertices'), what describes the change (parent 4, octant 1, source and place of 1.32 vertices 5 each)
-and the new rows of values (64 a vertex); the second moments follow when the old values are gone. A split needs less: the
-octree before it is a fraction of the one after it."""
+and the new rows of values (64 a vertex), where 1.32 vertices stay for each leaf that was; the second moments follow when
+the old values are gone. A split needs less: the octree before it is a fraction of the one after it."""
 TILE_BYTES_PER_PIXEL = 3.25
 """Per training pixel: 8-bit RGB, and a 64th of a tile's image, number, place in a queue (int32 each) and colour (bool)."""
-LEAVES_PER_PIXEL = 2.7
-"""Leaves of an octree split down to the pixel, for each pixel of one view: 1.70 million for lego at 800x800."""
+LEAVES_PER_PIXEL = 1.85
+"""Leaves of an octree split where it pays, for each pixel of one view: 1.18 million for lego at 800x800. Thick media have
+several times as many."""
+MOST_LEAVES = 1 << 27
+"""Eight corners each are numbered with 31 bits."""
 SHARE = 0.9
 """Of the memory at hand that a run may plan for."""
 
@@ -61,10 +64,11 @@ class MemoryEstimate:
         )
 
 
-def octree_bytes(leaves: int, sh_degree: int) -> int:
-    """Bytes of an octree of ``leaves`` leaves under training, with its second moments and statistics."""
+def octree_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> int:
+    """Bytes of an octree under training, with its second moments and statistics; ``vertices`` None: VERTICES_PER_LEAF."""
     rows = 2 * 4 * 16 * BLOCKS[sh_degree]
-    return int(leaves * (LEAF_BYTES + VERTICES_PER_LEAF * (VERTEX_BYTES + rows)))
+    count = VERTICES_PER_LEAF * leaves if vertices is None else vertices
+    return int(LEAF_BYTES * leaves + (VERTEX_BYTES + rows) * count)
 
 
 def estimate_training(dataset: Dataset, leaves: int, sh_degree: int, held_out_bytes: int = 0) -> MemoryEstimate:
@@ -95,32 +99,22 @@ def require_memory(estimate: MemoryEstimate, available: int | None = None) -> No
 
 
 def affordable_leaves(
-    dataset: Dataset,
-    sh_degree: int,
-    wanted: int,
-    least: int = 1 << 18,
-    available: int | None = None,
-    held_out_bytes: int = 0,
+    dataset: Dataset, sh_degree: int, least: int = 1 << 18, available: int | None = None, held_out_bytes: int = 0
 ) -> int:
-    """The most leaves, up to ``wanted``, with which training fits in the memory at hand.
+    """The most leaves with which training fits in the memory at hand; MOST_LEAVES where nobody tells how much that is.
 
     Raises:
         InputError: not even ``least`` leaves fit beside the images.
     """
     free = available_memory() if available is None else available
     if free is None:
-        return wanted
-
-    def fits(leaves: int) -> bool:
-        return estimate_training(dataset, leaves, sh_degree, held_out_bytes).peak <= SHARE * free
-
-    if fits(wanted):
-        return wanted
-    low, high = min(least, wanted), wanted
-    require_memory(estimate_training(dataset, low, sh_degree, held_out_bytes), free)
+        return MOST_LEAVES
+    require_memory(estimate_training(dataset, least, sh_degree, held_out_bytes), free)
+    low, high = least, MOST_LEAVES
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
+        fits = estimate_training(dataset, middle, sh_degree, held_out_bytes).peak <= SHARE * free
+        low, high = (middle, high) if fits else (low, middle)
     return low
 
 

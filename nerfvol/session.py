@@ -118,17 +118,14 @@ class Run:
         self.interrupted = False
         self.held_out = some_views(load_dataset(config.data, "val", config.downscale), LARGEST_HELD_OUT)
         self.dataset = load_dataset(config.data, "train", config.downscale)
-        self.max_leaves: int | None = None  # no bound
         for message in self.dataset.messages:
             print(message)
         require_something(self.dataset, config.background)
         lens = self.dataset.cameras[0].intrinsics
         held, degree = self.held_out.nbytes, config.octree.sh_degree
         wanted = largest_octree(config.octree.levels, lens.width * lens.height)
-        self.max_leaves = affordable_leaves(self.dataset, degree, wanted, held_out_bytes=held)
-        if self.max_leaves == wanted:
-            self.max_leaves = None
-        estimate = estimate_training(self.dataset, self.max_leaves or wanted, degree, held)
+        self.max_leaves = affordable_leaves(self.dataset, degree, least=min(wanted, 1 << 18), held_out_bytes=held)
+        estimate = estimate_training(self.dataset, min(wanted, self.max_leaves), degree, held)
         print(f"{len(self.dataset)} training views of {lens.width}x{lens.height}, {len(self.held_out)} held out; "
               f"memory: {estimate.sentence()}", flush=True)  # fmt: skip
         self.preview_folder = ensure_writable_folder(self.folder / runs.PREVIEWS)
