@@ -69,9 +69,10 @@ def single_scattering(title: str, size: int, beams: int, *lit: np.ndarray, repea
     fine = cumulus(*lit)
     fine.medium = fine.medium._replace(step=fine.medium.step / 4)
     truth = March(beams=beams).render(fine, camera).rgb
-    print(f"\n{title}, {size}x{size}\n| method | wall s | CPU s | view CPU s | faster | error | rms | bias |")
-    print("|---|---|---|---|---|---|---|---|")
-    slowest = None
+    print(f"\n{title}, {size}x{size}, median of {repeats}")
+    print("| method | wall s | CPU s | view CPU s | faster, wall | faster, CPU | error | rms | bias |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    rays = None
     for name, method in methods.items():
         method.render(scene, coarse)
 
@@ -81,11 +82,11 @@ def single_scattering(title: str, size: int, beams: int, *lit: np.ndarray, repea
 
         wall, cpu = seconds(anew, repeats)
         _, again = seconds(lambda method=method: method.render(scene, camera), repeats)
-        slowest = slowest or cpu
+        rays = rays or (wall, cpu)
         error, rms, bias = errors(method.render(scene, camera).rgb, truth)
         print(
-            f"| {name} | {wall:.2f} | {cpu:.2f} | {again:.2f} | {slowest / cpu:.1f} | {error:.2%} | {rms:.2%} "
-            f"| {bias:+.2%} |",
+            f"| {name} | {wall:.3f} | {cpu:.3f} | {again:.3f} | {rays[0] / wall:.1f} | {rays[1] / cpu:.1f} | {error:.2%} "
+            f"| {rms:.2%} | {bias:+.2%} |",
             flush=True,
         )
 

@@ -163,11 +163,9 @@ def _matrix(s) -> np.ndarray:
 def dense(m: Medium) -> np.ndarray:
     """The (nx, ny, nz) float32 density samples of a grid medium, the truth to compare a reconstruction with."""
     out = np.zeros([n * BRICK + 1 for n in m.bricks], np.float32)
-    for index, offset in enumerate(m.offsets):
-        if offset >= 0:
-            i, j, k = (BRICK * v for v in np.unravel_index(index, m.bricks))
-            block = m.samples[offset : offset + (BRICK + 1) ** 3].reshape((BRICK + 1,) * 3)
-            out[i : i + BRICK + 1, j : j + BRICK + 1, k : k + BRICK + 1] = block
+    side = (BRICK + 1,) * 3
+    bricks = np.lib.stride_tricks.sliding_window_view(out, side, writeable=True)[::BRICK, ::BRICK, ::BRICK]
+    bricks[m.offsets.reshape(m.bricks) >= 0] = m.samples.reshape(-1, *side)  # neighbours agree where they overlap
     return out[: m.cells[0] + 1, : m.cells[1] + 1, : m.cells[2] + 1]
 
 

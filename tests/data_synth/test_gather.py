@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_synth import Camera, DeepShadow, March, lights, look_at, materials, media, phase, surfaces, sweep
+from data_synth import Camera, DeepShadow, March, jit, lights, look_at, materials, media, phase, surfaces, sweep
 from data_synth.scene import Scene
 from data_synth.shadowmap import ShadowMaps
 from data_synth.transmittance import sample_transmittance
@@ -50,6 +50,34 @@ def test_sweep_is_the_integral_to_the_light():
         p = np.array(m.lo) + np.array([i, j, k]) * m.cell
         exact = -np.log(sample_transmittance(m, p, w, method="regular")[0, 0])
         assert thickness[i, j, k] == pytest.approx(exact, rel=5e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("towards", [(0.6, 0.2, 0.77), (-0.3, 0.9, 0.25), (1, 0, 0)])
+def test_sweep_has_the_same_bits_for_any_number_of_threads(towards, monkeypatch):
+    """On noise, so that every sample counts; several times over, so that threads meet; and with the bands in reverse."""
+    rho = np.random.default_rng(0).random((70, 80, 90), dtype=np.float32)
+
+    def swept(threads):
+        monkeypatch.setattr(jit, "core_count", lambda: threads)
+        return sweep.thickness(rho, (0.01, 0.012, 0.011), tuple(np.array(towards) / np.linalg.norm(towards)))
+
+    alone = swept(1)
+    assert alone.max() > 0.2
+    for threads in 3 * (2, 3, 8):
+        assert np.array_equal(swept(threads), alone), f"{threads} threads"
+    in_order = jit.in_parallel
+    monkeypatch.setattr(jit, "in_parallel", lambda work, jobs: in_order(work, reversed(list(jobs))))
+    assert np.array_equal(swept(1), alone)
+
+
+def test_the_picture_has_the_same_bits_for_any_number_of_threads(monkeypatch):
+    """From the sweep of two lights to the last pixel."""
+    pictures = []
+    for threads in (1, 2, 5):
+        monkeypatch.setattr(jit, "core_count", lambda threads=threads: threads)
+        scene = Scene(medium=cloud(41), lights=[SUN, lights.directional((-0.5, 0.3, 0.81), (1.0, 2.0, 3.0))])
+        pictures.append(DeepShadow().render(scene, CAMERA).rgb)
+    assert pictures[0].max() > 0 and np.array_equal(pictures[1], pictures[0]) and np.array_equal(pictures[2], pictures[0])
 
 
 def test_gathered_light_tends_to_the_march_as_the_grid_is_refined():
