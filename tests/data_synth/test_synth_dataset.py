@@ -1,6 +1,7 @@
 """Cameras, pictures, the folder that is written, and the command line."""
 
 import ast
+import inspect
 import json
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from data_synth import (
     media,
     render,
     scenes,
+    surfaces,
     transmittance,
     write_dataset,
 )
@@ -164,6 +166,20 @@ def test_imported_volume_fills_the_scene(tmp_path):
     centre = 0.5 * (np.array(scene.medium.lo) + scene.medium.hi)
     T = transmittance.sample_transmittance(scene.medium, centre - [0, 0, 1e-4], (0.0, 0.0, 1.0), 2e-4, "regular")
     assert -np.log(T[0, 0]) / 2e-4 == pytest.approx(3.0, rel=1e-2)
+
+
+@pytest.mark.parametrize("name", [n for n in scenes.SCENES if n != "showcase"])
+def test_no_surface_stands_in_the_box_of_a_written_density(name):
+    """density.npz knows the medium alone: what is compared inside its box must be medium alone as well."""
+    resolution = {"resolution": 16} if "resolution" in inspect.signature(scenes.SCENES[name]).parameters else {}
+    scene = scenes.make(name, **resolution)
+    if scene.medium is None or scene.medium.kind != media.GRID:
+        return
+    assert scene.triangles is None
+    for kind, _, *corners in scene.shapes:
+        assert kind == surfaces.BOX
+        lo, hi = np.array(corners[:3]), np.array(corners[3:6])
+        assert np.any(hi < np.array(scene.medium.lo) - 0.02) or np.any(lo > np.array(scene.medium.hi) + 0.02)
 
 
 def test_command_line(tmp_path, capsys):
