@@ -52,6 +52,14 @@ def test_sweep_is_the_integral_to_the_light():
         assert thickness[i, j, k] == pytest.approx(exact, rel=5e-3, abs=1e-5)
 
 
+def test_sweep_beside_a_hard_edge_is_not_negative():
+    """Cubics swing below 0 beside the shadow of a block; a negative thickness would be more light than there is."""
+    rho = np.zeros((40, 40, 40), np.float32)
+    rho[15:25, 15:25, 15:25] = 1.0
+    thickness = sweep.thickness(rho, (0.1,) * 3, (0.6, 0.2, np.sqrt(1 - 0.4)))
+    assert thickness.min() == 0.0 and 1.0 < thickness.max() < 0.1 * 10 * np.sqrt(3) + 0.1
+
+
 @pytest.mark.parametrize("towards", [(0.6, 0.2, 0.77), (-0.3, 0.9, 0.25), (1, 0, 0)])
 def test_sweep_has_the_same_bits_for_any_number_of_threads(towards, monkeypatch):
     """On noise, so that every sample counts; several times over, so that threads meet; and with the bands in reverse."""
