@@ -230,12 +230,9 @@ void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& wor
             alignas(32) float share[8];
             store(share, trilinear(h[i].fx, h[i].fy, h[i].fz));
             keep_in_memory(share);
-            const f16 g = __builtin_shufflevector(gradient, gradient, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+            const f16 g = spread(gradient);
             for (int k = 0; k < B; ++k) {
-                f16 gk = g;
-                if (B == 2 && k == 1)
-                    gk = __builtin_shufflevector(gradient, gradient, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 3);
-                gk *= load<f16>(basis.row[l] + 16 * k);
+                const f16 gk = (B == 2 && k == 1 ? spread_three(gradient) : g) * load<f16>(basis.row[l] + 16 * k);
                 for (int o = 0; o < 8; ++o) corner[o][k] += share[o] * gk;
             }
         }

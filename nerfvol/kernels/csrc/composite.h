@@ -44,7 +44,7 @@ struct Extinction {
     void evaluate(int n, float density_scale, bool with_slope) {
         for (int i = 0; i < n; i += 16) {
             const f16 r = load<f16>(raw + i), scaled = load<f16>(length + i) * density_scale;
-            const f16 tau = scaled * explin(r), e = exp16(-tau);
+            const f16 tau = scaled * explin(r), e = vexp(-tau);
             store(through + i, e);
             store(alpha + i, one_minus_exp(tau, e));
             if (with_slope) store(slope + i, scaled * explin_slope(r));

@@ -5,8 +5,6 @@
 
 namespace NERFVOL_ISA {
 
-typedef float f4 __attribute__((vector_size(16)));
-
 // Real spherical harmonics, the sign convention of PlenOctrees and 3DGS. y has (degree + 1)^2 entries.
 inline void sh_basis(int degree, float x, float y, float z, float* b) {
     b[0] = 0.28209479177387814f;
@@ -85,18 +83,16 @@ template <int B> struct LeafField {
         return front + x * back;
     }
 
+    // Only the first block holds a density.
+    static f4 without_density(f4 v) { return f4{v[0], v[1], v[2], 0.0f}; }
+
     // (r, g, b, raw density) at a point along a ray's basis: rgb without the constant 1/2.
     f4 at(float x, float y, float z, const float* basis) const {
         f4 out{};
         for (int k = 0; k < B; ++k) {
             const f16 terms = row(k, x, y, z) * load<f16>(basis + 16 * k);
-            const f16 q = quad_sums(terms);
-            f4 rgb = __builtin_shufflevector(q, q, 0, 4, 8, 12);
-            if (k > 0) {
-                rgb[3] = 0;  // only the first block holds a density
-                if (B == 2) rgb += __builtin_shufflevector(terms, splat16(0.0f), 12, 13, 14, 16);  // degree 2's ninth coefficient
-            }
-            out += rgb;
+            out += k == 0 ? quad_sums(terms) : without_density(quad_sums(terms));
+            if (k > 0 && B == 2) out += without_density(quarter<3>(terms));  // degree 2's ninth coefficients
         }
         return out;
     }
@@ -104,7 +100,7 @@ template <int B> struct LeafField {
     // d(raw density)/d(x, y, z) at a point.
     void density_slope(float x, float y, float z, float* g) const {
         float d[8];
-        for (int o = 0; o < 8; ++o) d[o] = c[o][0][kDensitySlot];
+        for (int o = 0; o < 8; ++o) d[o] = quarter<kDensitySlot / 4>(c[o][0])[0];
         g[0] = d[4] + z * d[5] + y * (d[6] + z * d[7]);
         g[1] = d[2] + z * d[3] + x * (d[6] + z * d[7]);
         g[2] = d[1] + y * d[3] + x * (d[5] + y * d[7]);
@@ -112,7 +108,7 @@ template <int B> struct LeafField {
 };
 
 // sigma / density_scale: exponential below 1, linear above (value and slope are continuous).
-inline f16 explin(f16 raw) { return raw < 1.0f ? exp16(raw - 1.0f) : raw; }
-inline f16 explin_slope(f16 raw) { return raw < 1.0f ? exp16(raw - 1.0f) : splat16(1.0f); }
+inline f16 explin(const f16& raw) { return select_less(raw, 1.0f, vexp(raw - 1.0f), raw); }
+inline f16 explin_slope(const f16& raw) { return select_less(raw, 1.0f, vexp(raw - 1.0f), splat16(1.0f)); }
 
 }  // namespace NERFVOL_ISA

@@ -89,7 +89,8 @@ template <int B> void apply(const GradientSink& sink, const VertexGradients& sum
     const float density = sink.optimizer ? sink.optimizer->rate_density : 0;
     f16 rate[B];
     for (int k = 0; k < B; ++k) rate[k] = splat16(sh);
-    rate[0] = f16{dc, sh, sh, sh, dc, sh, sh, sh, dc, sh, sh, sh, density, 0, 0, 0};
+    const f4 channel = {dc, sh, sh, sh};
+    rate[0] = join(channel, channel, channel, f4{density, 0, 0, 0});
     for (size_t i = 0; i < n; ++i) {
         const int32_t vertex = sums.vertices[i];
         const int64_t at = 16 * B * int64_t(vertex);
@@ -110,7 +111,7 @@ template <int B> void apply(const GradientSink& sink, const VertexGradients& sum
             float* moment = opt.moments + at + 16 * k;
             float* value = opt.values + at + 16 * k;
             const f16 old = load<f16>(moment), g2 = g * g;
-            const f16 m = old > 0.0f ? old * opt.beta + g2 * (1 - opt.beta) : g2;
+            const f16 m = select_less(-old, 0.0f, old * opt.beta + g2 * (1 - opt.beta), g2);
             alignas(64) float root[16];
             store(root, m);
             for (int j = 0; j < 16; ++j) root[j] = std::sqrt(root[j]) + opt.eps;

@@ -152,13 +152,32 @@ inline Range range_of(Interval s, const Packet::Grid& g) {
     return {__builtin_convertvector(first, i8v), __builtin_convertvector(last, i8v)};
 }
 
-// For each child the rays, as bits, inside its columns and rows.
-inline u8l rays_inside(Range columns, Range rows) {
+// The rays, as bits, inside the columns and rows of each of eight children (all rays for a child that is near), among `rays`.
+// Returns one bit for each child that has any.
+inline uint32_t rays_inside(Range columns, Range rows, i8v near, uint64_t rays, uint64_t* inside) {
     const i8v bits = (255 << columns.first) & (255 >> (7 - columns.last));
+#if defined(__AVX512F__)
     const u8l every = {~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull};
     const u8l from = every << __builtin_convertvector(8 * rows.first, u8l);
     const u8l to = every >> __builtin_convertvector(56 - 8 * rows.last, u8l);
-    return (__builtin_convertvector(bits, u8l) * 0x0101010101010101ull) & from & to;
+    const u8l met = (((__builtin_convertvector(bits, u8l) * 0x0101010101010101ull) & from & to) |
+                     (u8l)__builtin_convertvector(near, l8)) & rays;
+    store(inside, met);
+    return mask_bits(__builtin_convertvector((l8)(met != 0), i8v));
+#else
+    int32_t in_columns[8], first[8], last[8], close[8];
+    store(in_columns, bits);
+    store(first, rows.first);
+    store(last, rows.last);
+    store(close, near);
+    uint32_t some = 0;
+    for (int k = 0; k < 8; ++k) {
+        const uint64_t in_rows = (~0ull << 8 * first[k]) & (~0ull >> (56 - 8 * last[k]));
+        inside[k] = ((uint64_t(uint32_t(in_columns[k])) * 0x0101010101010101ull & in_rows) | uint64_t(int64_t(close[k]))) & rays;
+        some |= uint32_t(inside[k] != 0) << k;
+    }
+    return some;
+#endif
 }
 
 // Bits 0..7 of `m` with bit k moved to k ^ flip.
@@ -214,12 +233,9 @@ private:
             const f8 near_inverse = 1.0f / w_near, far_inverse = 1.0f / w_far;
             const Interval su = slopes(a, r_u_ * h + 1e-6f, near_inverse, far_inverse);
             const Interval sv = slopes(b, r_v_ * h + 1e-6f, near_inverse, far_inverse);
-            const u8l all = (u8l)__builtin_convertvector(near, l8);
-            const u8l met = (rays_inside(range_of(su, p_.columns), range_of(sv, p_.rows)) | all) & rays;
-            store(inside, met);
+            const uint32_t some = rays_inside(range_of(su, p_.columns), range_of(sv, p_.rows), near, rays, inside);
             const i8v meets = (su.hi >= p_.u_min) & (su.lo <= p_.u_max) & (sv.hi >= p_.v_min) & (sv.lo <= p_.v_max);
-            const i8v some = __builtin_convertvector((l8)(met != 0), i8v);
-            present &= mask_bits((near | meets) & some & (w_far > 0.0f));
+            present &= some & mask_bits((near | meets) & (w_far > 0.0f));
         }
         const uint32_t first = (p_.o[0] >= e.x + h ? 4u : 0u) | (p_.o[1] >= e.y + h ? 2u : 0u) | (p_.o[2] >= e.z + h ? 1u : 0u);
         uint32_t waiting = flipped(present, first);  // bit k: the k-th child on the way
@@ -267,7 +283,7 @@ inline uint64_t intersect(const Packet& p, const Leaf& leaf, Segments& s) {
         store(s.fx + base, vmin(vmax((middle * load<f16>(p.dx + base) - lo[0]) * per_side, zero), one));
         store(s.fy + base, vmin(vmax((middle * load<f16>(p.dy + base) - lo[1]) * per_side, zero), one));
         store(s.fz + base, vmin(vmax((middle * load<f16>(p.dz + base) - lo[2]) * per_side, zero), one));
-        hits |= uint64_t(mask_bits(tf > tn)) << base;
+        hits |= uint64_t(greater_bits(tf, tn)) << base;
     }
     return hits & leaf.rays;
 }
