@@ -46,7 +46,7 @@ def render_image(
 
 @functools.lru_cache(maxsize=1)
 def _tiled_directions(lens: Intrinsics) -> Float:
-    """Unit directions in camera axes, tile by tile: (rows of tiles, columns of tiles, 64, 3). Kept for a path.
+    """Unit directions in camera axes, tile by tile: (rows of tiles, columns of tiles, 3, 64). Kept for a path.
 
     Tiles that reach beyond the picture's edge are filled by repeating its last row and column.
     """
@@ -54,8 +54,8 @@ def _tiled_directions(lens: Intrinsics) -> Float:
     padding = ((0, -lens.height % TILE), (0, -lens.width % TILE), (0, 0))
     padded = np.pad(directions, padding, mode="edge") if padding != ((0, 0),) * 3 else directions
     height, width = padded.shape[:2]
-    tiles = padded.reshape(height // TILE, TILE, width // TILE, TILE, 3).swapaxes(1, 2)
-    return np.ascontiguousarray(tiles).reshape(height // TILE, width // TILE, TILE * TILE, 3)
+    tiles = padded.reshape(height // TILE, TILE, width // TILE, TILE, 3).transpose(0, 2, 4, 1, 3)
+    return np.ascontiguousarray(tiles).reshape(height // TILE, width // TILE, 3, TILE * TILE)
 
 
 def surface_depth(image: Mapping[str, Float]) -> Float:

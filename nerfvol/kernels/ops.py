@@ -161,11 +161,11 @@ def render_view(
 ) -> dict[str, np.ndarray]:
     """Renders a camera's picture of ``size`` (height, width); results as in :func:`render_rays`, (height, width[, 3]).
 
-    directions: (tile rows, tile columns, 64, 3) float32 unit directions in camera axes, one row of 64 for each 8x8 tile;
+    directions: (tile rows, tile columns, 3, 64) float32 unit directions in camera axes, a row of 64 for each 8x8 tile;
     tiles at the right and lower edge may reach beyond the picture. camera_to_world: (4, 4), or (3, 4).
     """
     height, width = size
-    tiles = (-(-height // 8), -(-width // 8), TILE, 3)
+    tiles = (-(-height // 8), -(-width // 8), 3, TILE)
     if directions.shape != tiles or directions.dtype != np.float32 or not directions.flags.c_contiguous:
         raise ValueError(f"directions must be float32 {tiles}, got {directions.dtype} {directions.shape}")
     rotation, origin = np.asarray(camera_to_world)[:3, :3], np.asarray(camera_to_world, np.float32)[:3, 3]
@@ -174,7 +174,7 @@ def render_view(
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
     _check_outputs(outputs)
     if (compiled := native()) is None:
-        flat = directions.reshape(-1, 3) @ rotation.T.astype(np.float32)
+        flat = directions.swapaxes(2, 3).reshape(-1, 3) @ rotation.T.astype(np.float32)
         origins = np.broadcast_to(origin, (len(flat) // TILE, 3)).copy()
         rays = _on_torch().render_rays(octree, origins, flat, bg, eps, outputs)
         return {name: _from_tiles(rows, tiles[0], tiles[1])[:height, :width] for name, rows in rays.items()}

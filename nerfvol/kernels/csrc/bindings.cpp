@@ -83,7 +83,7 @@ void py_render(const TreeArrays& t, Rows origins, Rows directions, std::vector<f
 }
 
 // Directions of a camera's rays (tile rows, tile columns, 64, 3); outputs are pictures (height, width[, 3]).
-void py_render_view(const TreeArrays& t, In<float, nb::shape<-1, -1, 64, 3>> directions, std::vector<float> rotation,
+void py_render_view(const TreeArrays& t, In<float, nb::shape<-1, -1, 3, 64>> directions, std::vector<float> rotation,
                     std::vector<float> origin, int64_t height, int64_t width, std::vector<float> background, float eps,
                     Maybe<Out<float, nb::ndim<3>>> rgb, Maybe<FloatRows> trans, Maybe<FloatRows> depth, Maybe<FloatRows> median,
                     Maybe<Out<float, nb::ndim<3>>> normal) {

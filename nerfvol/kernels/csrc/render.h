@@ -29,11 +29,16 @@ inline int load_packet(const Tree& tree, const Rays& rays, int64_t first, int64_
 // Loads one tile of a view.
 inline void load_tile(const Tree& tree, const View& view, int64_t row, int64_t column, Packet& p) {
     const float* tile = view.directions + 3 * kTile * (row * view.tile_columns + column);
-    const float* r = view.rotation;
-    for (int l = 0; l < kTile; ++l) {
-        const float* c = tile + 3 * l;
-        const float d[3] = {dot3(r, c), dot3(r + 3, c), dot3(r + 6, c)};
-        set_direction(p, l, d);
+    float* const directions[3] = {p.dx, p.dy, p.dz};
+    float* const reciprocals[3] = {p.ix, p.iy, p.iz};
+    for (int l = 0; l < kTile; l += 16) {
+        const f16 x = load<f16>(tile + l), y = load<f16>(tile + kTile + l), z = load<f16>(tile + 2 * kTile + l);
+        for (int k = 0; k < 3; ++k) {
+            const float* r = view.rotation + 3 * k;
+            const f16 d = r[0] * x + r[1] * y + r[2] * z;
+            store(directions[k] + l, d);
+            store(reciprocals[k] + l, select_less(vmax(d, -d), 1e-20f, splat16(1e20f), 1.0f / d));
+        }
     }
     p.alive = ~0ull;
     for (int k = 0; k < 3; ++k) p.o[k] = (view.origin[k] - tree.origin[k]) / tree.size;

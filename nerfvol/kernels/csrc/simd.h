@@ -90,6 +90,12 @@ template <class H> inline Pair<H> select_less(const Pair<H>& x, float limit, con
     return {select_less(x.lo, limit, a.lo, b.lo), select_less(x.hi, limit, a.hi, b.hi)};
 }
 
+inline float least(f8 v) {
+    v = vmin(v, __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3));
+    v = vmin(v, __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5));
+    return v[0] < v[1] ? v[0] : v[1];
+}
+
 // One bit per lane of a comparison's result.
 inline uint32_t mask_bits(i4v m) {
 #if defined(__SSE2__)

@@ -49,6 +49,22 @@ inline void set_direction(Packet& p, int lane, const float* d) {
     p.ix[lane] = reciprocal(d[0]); p.iy[lane] = reciprocal(d[1]); p.iz[lane] = reciprocal(d[2]);
 }
 
+// The C library's fmax and fmin are calls, for the sake of NaN.
+inline float larger(float a, float b) { return a > b ? a : b; }
+
+// Sum of x[l] over the lanes l in `lanes`.
+inline float sum_where(const float* x, uint64_t lanes) {
+    float sum = 0;
+    if (lanes == ~0ull) {
+        f8 sums = load<f8>(x);
+        for (int l = 8; l < kTile; l += 8) sums += load<f8>(x + l);
+        for (int k = 0; k < 8; ++k) sum += sums[k];
+    } else {
+        for (; lanes; lanes &= lanes - 1) sum += x[__builtin_ctzll(lanes)];
+    }
+    return sum;
+}
+
 // The slopes of eight columns (or rows) of rays as an even grid: column k has slopes inside k / per_step + [high, low],
 // high <= low, so that those at or above a slope s are k >= (s - low) * per_step, those below it k <= (s - high) * per_step,
 // and no ray is missed however uneven the columns are.
@@ -57,12 +73,12 @@ inline Packet::Grid even_grid(const float* lowest, const float* highest) {
     for (int k = 0; k < 8; ++k)
         if (lowest[k] <= highest[k]) { last = k; if (first < 0) first = k; }
     const float from = lowest[first] + highest[first], to = lowest[last] + highest[last];
-    const float step = std::fmax(last > first ? 0.5f * (to - from) / float(last - first) : 0.0f, 1e-7f);
+    const float step = larger(last > first ? 0.5f * (to - from) / float(last - first) : 0.0f, 1e-7f);
     Packet::Grid g = {-1e30f, 1e30f, 1.0f / step};
     for (int k = first; k <= last; ++k)
         if (lowest[k] <= highest[k]) {
-            g.low = std::fmax(g.low, highest[k] - k * step);
-            g.high = std::fmin(g.high, lowest[k] - k * step);
+            g.low = larger(g.low, highest[k] - k * step);
+            g.high = -larger(-g.high, k * step - lowest[k]);
         }
     g.low += 1e-3f * step + 1e-7f;
     g.high -= 1e-3f * step + 1e-7f;
@@ -73,15 +89,13 @@ inline Packet::Grid even_grid(const float* lowest, const float* highest) {
 // image tile is tight. Packets wider than about 140 degrees are left unbounded.
 inline void bound_packet(Packet& p) {
     p.bounded = false;
-    float axis[3] = {0, 0, 0}, across[3] = {0, 0, 0};
-    int first = -1, last_in_row = -1;
-    for (int l = 0; l < kTile; ++l)
-        if (p.alive >> l & 1) {
-            axis[0] += p.dx[l]; axis[1] += p.dy[l]; axis[2] += p.dz[l];
-            if (first < 0) first = l;
-            if (l / 8 == first / 8) last_in_row = l;
-        }
-    if (first < 0 || dot3(axis, axis) < 1e-6f) return;
+    if (!p.alive) return;
+    const int first = __builtin_ctzll(p.alive), row = first / 8;
+    const int last_in_row = 8 * row + 31 - __builtin_clz(uint32_t(p.alive >> 8 * row & 0xff));
+    const float *rays[3] = {p.dx, p.dy, p.dz};
+    float axis[3], across[3];
+    for (int k = 0; k < 3; ++k) axis[k] = sum_where(rays[k], p.alive);
+    if (dot3(axis, axis) < 1e-6f) return;
     normalize3(axis);
     across[0] = p.dx[last_in_row] - p.dx[first];
     across[1] = p.dy[last_in_row] - p.dy[first];
@@ -111,17 +125,14 @@ inline void bound_packet(Packet& p) {
         const i8v lives = (bit & int32_t(alive)) != 0;
         col_min = lives ? vmin(col_min, su) : col_min;
         col_max = lives ? vmax(col_max, su) : col_max;
-        for (int c = 0; c < 8; ++c)
-            if (alive >> c & 1) { row_min[r] = std::fmin(row_min[r], sv[c]); row_max[r] = std::fmax(row_max[r], sv[c]); }
+        row_min[r] = least(lives ? sv : splat8(1e30f));
+        row_max[r] = -least(lives ? -sv : splat8(1e30f));
     }
     float columns_min[8], columns_max[8];
     store(columns_min, col_min);
     store(columns_max, col_max);
-    p.u_min = p.v_min = 1e30f; p.u_max = p.v_max = -1e30f;
-    for (int k = 0; k < 8; ++k) {
-        p.u_min = std::fmin(p.u_min, columns_min[k]); p.u_max = std::fmax(p.u_max, columns_max[k]);
-        p.v_min = std::fmin(p.v_min, row_min[k]); p.v_max = std::fmax(p.v_max, row_max[k]);
-    }
+    p.u_min = least(col_min); p.u_max = -least(-col_max);
+    p.v_min = least(load<f8>(row_min)); p.v_max = -least(-load<f8>(row_max));
     p.columns = even_grid(columns_min, columns_max);
     p.rows = even_grid(row_min, row_max);
     for (int k = 0; k < 3; ++k) { p.axis[k] = axis[k]; p.u[k] = across[k]; p.v[k] = down[k]; }

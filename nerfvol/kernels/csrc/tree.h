@@ -29,7 +29,7 @@ struct Rays {
 
 // A camera's rays: directions in camera axes, tile by tile, rows of tiles from the top; tiles may reach beyond the edges.
 struct View {
-    const float* directions;                     // (tile rows, tile columns, 64, 3) unit length
+    const float* directions;                     // (tile rows, tile columns, 3, 64) unit length
     int64_t tile_rows, tile_columns, height, width;
     float rotation[9], origin[3];                // camera to world, row by row; scene units
 };
