@@ -61,7 +61,8 @@ private:
     size_t capacity_ = 0, row_floats_ = 0;
 };
 
-// Where each vertex stands in VertexGradients: open addressing, at most an eighth full since corners are shared.
+// Where each vertex stands in VertexGradients: open addressing in a table that cannot fill up, as a rule a quarter full since
+// leaves share corners.
 class VertexTable {
 public:
     void start(size_t n) {  // n: an upper bound of the vertices
