@@ -10,6 +10,7 @@ from nerfvol.kernels import on_torch, ops, reference
 from nerfvol.octree import Octree, sh_slots
 from tests.kernels import rounding
 from tests.kernels.test_ops import Case, assert_within, build, per_ray, traced
+from tests.kernels.trees import unit
 
 U = rounding.U
 BACKGROUND = (1.0, 0.8, 0.3)
@@ -201,6 +202,28 @@ def test_statistics_of_the_leaves(isa):
     assert report.samples == pytest.approx(len(ray) / len(batch.weight), rel=1e-3)
     state.reset_statistics(n)
     assert not state.error.any() and not state.max_weight.any() and not state.footprint.any()
+
+
+@pytest.mark.parametrize("origin, way, first_cell, crossed", [
+    ((-1, -1, -1), (1, 1, 1), (0, 0, 0), 4),  # the cube's diagonal, through vertices
+    ((2, 2, 2), (-1, -1, -1), (1, 1, 1), 2),  # the same from its middle
+    ((-1, 5, 1.5), (1, -1, 0), (0, 3, 1), 4),  # a face's diagonal, through edges
+])  # fmt: skip
+def test_a_box_touched_in_a_point_or_an_edge_is_not_hit(isa, origin, way, first_cell, crossed):
+    """A diagonal of 4 x 4 x 4 cells crosses some and touches their neighbours.
+
+    Everything is dyadic, so the distances of the planes that meet there are equal numbers and a touch has no length: it
+    counts as no sample, and the second moments at the touched cells' own vertices do not decay.
+    """
+    octree = Octree.from_leaves(np.full(64, 2), np.argwhere(np.ones((4, 4, 4))), (0, 0, 0), 4.0, 0, 1.0)
+    state = ops.TrainState(octree)
+    state.moments[:] = 1
+    ray = np.array([origin], np.float32), unit([way])
+    batch = ops.Batch(*ray, np.zeros((1, 3), np.float32), np.ones(1, np.float32))
+    report = ops.train_step(octree, state, batch, LOSSES["plain"], ops.Rates(0, 0, 0), PIXEL_ANGLE)
+    leaves = octree.query([np.array(first_cell) + 0.5 + k * np.array(way) for k in range(crossed)])
+    assert report.samples == crossed
+    assert np.array_equal(np.flatnonzero((state.moments != 1).any(1)), np.unique(octree.corners[leaves]))
 
 
 def test_training_descends(isa):
