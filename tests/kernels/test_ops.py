@@ -152,6 +152,41 @@ def test_rays_along_faces_and_edges(isa, kind):
     assert_within("depth", out["depth"], theirs["depth"], bounds["depth"])
 
 
+@functools.cache
+def rows_in_planes():
+    """An octree and 16 tiles: the middle row of seven, and the eighth alone with an origin of its own, in a plane."""
+    rng = np.random.default_rng(19)
+    octree = random_octree("mixed", 1, rng)
+    finest = 2**octree.max_level
+    rays_o, rays_d = [], []
+    for tile in range(16):
+        o = octree.origin + octree.size * rng.uniform(-0.5, 1.5, 3)
+        o[1] = octree.origin[1] + octree.size * rng.integers(0, finest) / finest
+        forward = octree.origin + octree.size * rng.uniform(0.3, 0.7, 3) - o
+        forward = forward * [1, 0, 1] / np.hypot(forward[0], forward[2])
+        up = np.array([0, 1, 0]) if tile % 2 else np.array([0, -1, 0])
+        side, down = np.cross(forward, up), -up
+        u, v = np.meshgrid((np.arange(8) - 3.5) * 0.02, np.append(np.arange(7) - 3, 0) * rng.choice([0.05, 0.2]))
+        d = unit(forward + u[..., None] * side + v[..., None] * down).reshape(64, 3)
+        o = np.where(np.arange(64)[:, None] < 56, o, o + 0.3 * side)
+        rays_o.append(np.roll(o - octree.origin, tile % 3, 1) + octree.origin)
+        rays_d.append(np.roll(d, tile % 3, 1))
+    o, d = np.concatenate(rays_o).astype(np.float32), np.concatenate(rays_d)
+    assert (d == 0).any(1).sum() == 2 * 8 * 16
+    return octree, o, d, truth(octree, o, d), rounding.image_bounds(rounding.trace(octree, o, d), octree, BACKGROUND)
+
+
+def test_tiles_with_a_row_in_a_plane_of_faces(isa):
+    """A row that runs exactly in a plane between cells is at the edge of what it may meet, and crosses it at full length.
+
+    What discards cells for a whole tile is tight there, since the tile's axis lies in the plane too.
+    """
+    octree, o, d, theirs, bounds = rows_in_planes()
+    out = ops.render_rays(octree, o, d, BACKGROUND, 0.0)
+    for name in ("rgb", "depth"):
+        assert_within(name, out[name], theirs[name], bounds[name])
+
+
 def test_a_ray_in_a_plane_of_faces_belongs_to_the_box_above(isa):
     """Two leaves side by side, the ray in their common face, then in the outer faces."""
     octree = Octree.from_leaves([1, 1], [[0, 0, 0], [0, 1, 0]], (0, 0, 0), 2.0, 0, 1.0)
