@@ -7,6 +7,7 @@ from nerfvol import tiles
 from nerfvol.cameras import Intrinsics, orbit
 from nerfvol.datasets import Dataset, SceneBounds
 from nerfvol.kernels.ops import TILE
+from nerfvol.native import native
 from nerfvol.tiles import Cursor, TileBank
 
 WHITE = (1.0, 1.0, 1.0)
@@ -155,9 +156,34 @@ def test_without_compiled_code_the_batch_is_the_same(odd, monkeypatch):
         np.testing.assert_array_equal(getattr(plain, name), getattr(compiled, name))
 
 
-def test_tiles_outside_their_picture_are_refused(odd):
+def gathered(**change):
+    """Three tiles of two pictures, of 2 and 3 tiles, by the compiled code alone."""
+    arrays = dict(
+        directions=[np.zeros((n, TILE, 3), np.float32) for n in (2, 3)],
+        pixels=[np.zeros((n, TILE, 3), np.uint8) for n in (2, 3)],
+        rotations=np.zeros((2, 3, 3), np.float32), image=np.array([0, 1, 1]), tile=np.array([1, 0, 2]),
+        out=np.zeros((3, TILE, 3), np.float32), target=np.zeros((3, TILE, 3), np.float32),
+    )  # fmt: skip
+    native().gather_tiles(**arrays | change)
+
+
+@pytest.mark.skipif(native() is None, reason="no compiled kernels")
+@pytest.mark.parametrize("image, tile", [(0, 2), (1, 3), (1, 10**6), (1, -1), (2, 0), (-1, 0)])
+def test_tiles_outside_their_picture_are_refused(image, tile):
     """The compiled code reads where it is told: it looks first."""
-    bank = TileBank(odd, WHITE, 1)
-    bank.tile = bank.tile + 10**6
-    with pytest.raises((ValueError, IndexError)):
-        whole_batch(bank)
+    gathered()
+    with pytest.raises(ValueError, match="a tile lies outside its picture"):
+        gathered(image=np.array([0, 1, image]), tile=np.array([1, 0, tile]))
+
+
+@pytest.mark.skipif(native() is None, reason="no compiled kernels")
+@pytest.mark.parametrize("change", [
+    {"tile": np.array([1, 0])}, {"out": np.zeros((2, TILE, 3), np.float32)},
+    {"target": np.zeros((2, TILE, 3), np.float32)}, {"rotations": np.zeros((1, 3, 3), np.float32)},
+    {"directions": [np.zeros((9, TILE, 3), np.float32)]},
+    {"pixels": [np.zeros((n, TILE, 3), np.uint8) for n in (2, 2)]},
+    {"directions": [np.zeros((n, TILE, 3), np.float32) for n in (2, 2)]},
+])  # fmt: skip
+def test_arrays_that_do_not_fit_each_other_are_refused(change):
+    with pytest.raises(ValueError):
+        gathered(**change)
