@@ -152,3 +152,24 @@ def test_slab(isa, sigma):
     bound = 2**-24 + np.exp(-tau) * tau * 64 * 8 * 2**-24
     assert (np.abs(1 - out["opacity"] - np.exp(-tau)) < bound).all()
     assert np.abs(out["rgb"] - 0.5 * out["opacity"][:, None]).max() < 64 * 2**-24
+
+
+@pytest.mark.parametrize("n_leaves", [31, 32, 63, 64, 127, 128])
+def test_every_vertex_of_a_row_gets_its_gradient_once(isa, n_leaves):
+    """A ray through the middle of a row of cells, dT / d(raw) = -T scale side / 8 for each cell that a vertex is of.
+
+    The vertices' gradients are summed in ranges of equal size; these rows have just as many vertices as fill all ranges,
+    or four more. raw = 1, where explin is 1 with slope 1. T is a product of n_leaves exponentials: 4 u each, and 16 u.
+    """
+    cells = np.column_stack([np.arange(n_leaves), np.full((n_leaves, 2), 5)])
+    octree = Octree.from_leaves(np.full(n_leaves, 7), cells, (0, 0, 0), 1.0, 0, 1.5)
+    octree.density = 1.0
+    middle = 5.5 / 128
+    ray = np.array([[-0.5, middle, middle]]), np.array([[1, 0, 0]], np.float32)
+    values = torch.from_numpy(octree.values).requires_grad_()
+    trans = on_torch.render_values(octree, values, *ray)[1]
+    gradient = torch.autograd.grad(trans.sum(), values)[0].numpy()[:, 12]
+    assert octree.n_vertices == 4 * (n_leaves + 1)
+    cells_of_vertex = np.bincount(octree.corners.ravel())
+    expected = -np.exp(-1.5 * n_leaves / 128) * 1.5 / 128 * cells_of_vertex / 8
+    assert np.abs(gradient / expected - 1).max() < (4 * n_leaves + 16) * 2**-24
