@@ -119,6 +119,7 @@ def test_released_images_are_read_again(tiny_scene):
     dataset.release()
     assert "images" not in vars(dataset)
     assert all(np.array_equal(a, b) for a, b in zip(dataset.images, before, strict=True))
+    assert dataset.images is dataset.images  # and not once more for whoever asks next
     part = dataclasses.replace(dataset, images=dataset.images[:2])
     part.release()  # its images are not those of the files: it keeps them
     assert len(part.images) == 2

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -60,6 +61,10 @@ def log_of(run: Path) -> list[dict]:
     return [json.loads(line) for line in (run / runs.LOG).read_text().splitlines()]
 
 
+def metrics_of(run: Path) -> dict:
+    return json.loads((run / runs.METRICS).read_text())
+
+
 @dataclasses.dataclass
 class Whole:
     """An uninterrupted run and a copy of each checkpoint it wrote, with its phase and step."""
@@ -106,6 +111,8 @@ def test_resumed_anywhere_the_octree_is_the_same(whole, tmp_path, tiny_scene):
         shutil.copy(whole.checkpoints[phase, step], out / runs.CHECKPOINT)
         start(settings(tiny_scene, out, init=init, resume=True, checkpoint_every=1000))
         assert product(out) == product(whole.run), f"resumed at step {step} of the {phase}"
+        assert metrics_of(out)["steps"] == metrics_of(whole.run)["steps"]
+        assert list(metrics_of(out)["stages"]) == list(metrics_of(whole.run)["stages"])
 
 
 def load_config(run: Path) -> dict:
@@ -177,6 +184,75 @@ def test_a_finished_run_says_so(whole, command):
 
 
 # ---------------------------------------------------------------- interruptions
+def resumed(whole: Whole, out: Path, scene: Path, step: int, change=lambda state: None) -> Path:
+    """The run as it goes on in ``out`` from the checkpoint after a step of the octree, which ``change`` may edit."""
+    out.mkdir()
+    shutil.copy(whole.run / runs.CONFIG, out)
+    shutil.copy(whole.run / runs.LOG, out)
+    state = load_checkpoint(whole.checkpoints["octree", step])
+    change(state)
+    save_checkpoint(out / runs.CHECKPOINT, state)
+    init = load_config(whole.run)["init"]
+    return start(settings(scene, out, init=init, resume=True, checkpoint_every=1000))
+
+
+def test_the_log_goes_on_where_the_checkpoint_left_it(whole, tmp_path, tiny_scene):
+    """What a killed run logged after its last checkpoint is cut off; what it logged before stays."""
+    for step in (45, 55):  # before and after the line of step 50
+        run = resumed(whole, tmp_path / str(step), tiny_scene, step)
+        lines, expected = ([(line["phase"], line["step"]) for line in log_of(r)] for r in (run, whole.run))
+        assert lines == expected and lines[-2:] == [("octree", 50), ("octree", 60)]
+
+
+def test_clock_and_running_error_go_on_where_the_checkpoint_left_them(whole, tmp_path, tiny_scene):
+    """Years on the clock and a running error of 1 at step 55: five steps later the log and the scores know of both."""
+    change = {"elapsed": 3e8, "phase_started": 2e8, "running": 1.0}
+    run = resumed(whole, tmp_path / "run", tiny_scene, 55, lambda state: state.update(change))
+    last, metrics = log_of(run)[-1], metrics_of(run)
+    assert last["step"] == 60 and 3e8 < last["seconds"] < metrics["seconds"] < 3.1e8
+    new_share = 1 - session.RUNNING**5  # of the five steps' errors, each below 1
+    assert 10 ** (-last["psnr"] / 10) == pytest.approx(1 - new_share, abs=new_share)
+    if metrics["stages"]:
+        assert 1e8 < metrics["stages"]["fine_tuned"]["seconds"] < 1.1e8
+
+
+@pytest.mark.parametrize("change", [
+    lambda t: t.update(values=t["values"][:-1], moments=t["moments"][:-1]), lambda t: t.update(moments=t["moments"][:, :4]),
+    lambda t: t.update(error=t["error"][:-1]), lambda t: t.update(footprint=t["footprint"][None]),
+    lambda t: t.update(node_mask=t["node_mask"][:-1]), lambda t: t.update(stage="first"), lambda t: t.pop("rich"),
+])  # fmt: skip
+def test_a_checkpoint_whose_parts_do_not_fit_is_refused(whole, tmp_path, tiny_scene, change):
+    with pytest.raises(InputError):
+        resumed(whole, tmp_path / "run", tiny_scene, 45, lambda state: change(state["trainer"]))
+
+
+def test_the_pictures_are_let_go_once_they_are_in_tiles(tmp_path, tiny_scene, monkeypatch):
+    """The first stage learns from half the resolution: only what the second makes of the pictures serves to the end."""
+    follow, held = session.Run.follow, {}
+
+    def look(self, phase, error):
+        follow(self, phase, error)
+        held.setdefault(phase.stage, []).append("images" in vars(self.dataset))
+
+    monkeypatch.setattr(session.Run, "follow", look)
+    start(settings(tiny_scene, tmp_path, checkpoint_every=1000))
+    assert all(held[0]) and held[1][0] and not any(held[1][1:]) and not any(held[2])
+
+
+def test_a_run_outside_the_main_thread_leaves_signals_alone(tmp_path, tiny_scene):
+    run = session.Run(settings(tiny_scene, tmp_path), session.Clock(None, 0.0), None)
+    handler, seen = signal.getsignal(signal.SIGINT), []
+
+    def work():
+        with run.interruptible():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [handler]
+
+
 def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, tiny_scene, command, monkeypatch):
     (tmp_path / "tiny.yaml").write_text(json.dumps({**TINY, "checkpoint_every": 1000}))
     follow = session.Run.follow
@@ -251,6 +327,56 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
         assert metrics["stages"]["field"]["seconds"] == pytest.approx(session.FIELD_SHARE * 8, abs=0.1)
 
 
+@dataclasses.dataclass
+class Pretended:
+    """What a run asks of a phase for its plans."""
+
+    name: str
+    n_leaves: int = 0
+
+
+def test_shares_of_a_budget(tmp_path, tiny_scene, monkeypatch):
+    """100 seconds, 20 of them for the end; a phase that begins at 10 has 70 left, of which the field gets 30 percent."""
+    monkeypatch.setattr(session.Run, "_time_to_finish", lambda self, phase=None: 20.0)
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 13.5)
+    for most, share in ((75.0, 21.0), (7.0, 7.0)):
+        field = {**TINY["field"], "time_budget": most}
+        config = settings(tiny_scene, tmp_path, init="mlp", time_budget=100.0, field=field)
+        run = session.Run(config, session.Clock(0.0, 0.0), None)
+        run.phase_started = 10.0
+        assert run.progress(Pretended("field")) == pytest.approx(3.5 / share)
+        assert run.progress(Pretended("octree")) == pytest.approx(3.5 / 70)
+
+
+def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
+    """By a clock that goes on a second at every look, with a picture that takes 10 more, on one thread.
+
+    A view takes one second to score, and to render a guess of 0.1 microseconds a pixel before there is a picture and 11
+    seconds then. Two views are held out; a tenth is added for what else they need.
+    """
+    seconds = [0.0]
+
+    def look() -> float:
+        seconds[0] += 1
+        return seconds[0]
+
+    def picture(camera):
+        seconds[0] += 10
+
+    monkeypatch.setattr(session.time, "perf_counter", look)
+    cli.set_threads(1)
+    run = session.Run(settings(tiny_scene, tmp_path, time_budget=1000.0), session.Clock(0.0, 0.0), None)
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0)
+    writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 1_000_000
+    octree = Pretended("octree")
+    assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 2.2 * (1 + 1600e-7))
+    octree.picture, octree.stage, octree.trainer, octree.n_leaves = picture, 0, Pretended("trainer"), 3_000_000
+    octree.trainer.bank = None
+    run.enter_stage(octree)
+    writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 3_000_000
+    assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 2.2 * (1 + 11))
+
+
 def test_a_budget_is_kept(tmp_path, tiny_scene):
     """On the real clock; a step of this scene takes milliseconds."""
     config = settings(tiny_scene, tmp_path, time_budget=3.0, checkpoint_every=1000)
@@ -288,7 +414,9 @@ def test_a_resumed_run_keeps_its_settings(tmp_path, tiny_scene, command):
 
 @pytest.mark.parametrize("state", [
     {}, {"phase": "octree"}, {"phase": "lunch", "steps": 3}, {"phase": "done"},
-    {"phase": "octree", "trainer": {"values": np.zeros(3)}}, {"phase": ["octree"]},
+    {"phase": "octree", "trainer": {"values": np.zeros(3)}}, {"phase": ["octree"]}, {"phase": "octree", "trainer": 3},
+    {"phase": "octree", "trainer": {}, "elapsed": "long"}, {"phase": "field", "trainer": {}, "log_bytes": 0.5},
+    {"phase": "octree", "trainer": {}, "stages": []}, {"phase": "octree", "trainer": {}, "running": None},
 ])  # fmt: skip
 def test_a_foreign_checkpoint_is_one_sentence(tmp_path, tiny_scene, command, state):
     runs.prepare(settings(tiny_scene, tmp_path))
@@ -321,16 +449,36 @@ def test_a_collapse_is_said_early(tmp_path, tiny_scene, init, section, more):
     assert [line["progress"] for line in log_of(tmp_path) if line["progress"] > 0.2] == []
 
 
-def test_divergence_does_not_reach_a_checkpoint(tmp_path, tiny_scene, monkeypatch):
+@pytest.mark.parametrize("error", ["nan", "inf"])
+def test_divergence_does_not_reach_a_checkpoint(tmp_path, tiny_scene, monkeypatch, error):
     step = trainer.OctreePhase.step
 
     def explode(self, progress):
-        return (float("nan"), 1.0) if self.steps_done == 5 else step(self, progress)
+        found, samples = step(self, progress)
+        return (float(error) if self.steps_done == 6 else found), samples
 
     monkeypatch.setattr(trainer.OctreePhase, "step", explode)
-    with pytest.raises(InputError, match="diverged at step 5.*learning rates"):
+    with pytest.raises(InputError, match=f"diverged at step 6.*error is {error}.*learning rates"):
         start(settings(tiny_scene, tmp_path))
     assert load_checkpoint(tmp_path / runs.CHECKPOINT)["trainer"]["step_count"] == 5
+
+
+def test_the_running_error_follows_slowly(tmp_path, tiny_scene):
+    run, phase = session.Run(settings(tiny_scene, tmp_path), session.Clock(None, 0.0), None), Pretended("octree")
+    phase.steps_done = 1
+    for error, running in ((1.0, 1.0), (0.0, 0.98), (0.5, 0.98**2 + 0.01)):
+        run.follow(phase, error)
+        assert run.running == pytest.approx(running)
+
+
+def test_a_run_scores_itself_on_views_from_all_around(tiny_scene):
+    dataset = load_dataset(tiny_scene, "train")
+    few = session.some_views(dataset, 3)
+    assert few.names == [dataset.names[i] for i in (0, 6, 11)]
+    for name, image, camera in zip(few.names, few.images, few.cameras, strict=True):
+        i = dataset.names.index(name)
+        assert image is dataset.images[i] and camera is dataset.cameras[i]
+    assert session.some_views(dataset, 12) is dataset
 
 
 # ---------------------------------------------------------------- a real scene
