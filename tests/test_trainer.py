@@ -100,6 +100,7 @@ def test_resumed_anywhere_the_octree_is_the_same(whole, tmp_path, tiny_scene):
         stages[phase, step] = (state.get("stage"), state.get("prunings"), len(state.get("node_mask", [])))
     keys = list(whole.checkpoints)
     changes = [i for i in range(1, len(keys)) if stages[keys[i]] != stages[keys[i - 1]]]
+    assert {(phase, 0) for phase, _ in keys} <= set(keys)  # each phase begins with one
     assert {stages[key][0] for key in keys if key[0] == "octree"} >= {1, 2}  # a distilled octree skips the first stage
     wanted = {0, len(keys) - 1, 7, *changes, *(i - 1 for i in changes)}
     init = load_config(whole.run)["init"]
@@ -226,17 +227,25 @@ def test_a_checkpoint_whose_parts_do_not_fit_is_refused(whole, tmp_path, tiny_sc
         resumed(whole, tmp_path / "run", tiny_scene, 45, lambda state: change(state["trainer"]))
 
 
-def test_the_pictures_are_let_go_once_they_are_in_tiles(tmp_path, tiny_scene, monkeypatch):
-    """The first stage learns from half the resolution: only what the second makes of the pictures serves to the end."""
-    follow, held = session.Run.follow, {}
+@pytest.mark.parametrize("downscales, checkpoint_every, last", [
+    ([2, 1, 1], 1000, 1), ([2, 1, 1], 1e-9, 1), ([1, 1, 1], 1e-9, 0)
+])  # fmt: skip
+def test_the_pictures_are_let_go_once_they_are_in_tiles(
+    tmp_path, tiny_scene, monkeypatch, downscales, checkpoint_every, last
+):
+    """From the second step of the stage whose tiles serve to the end; ``last``: the first stage of the last resolution."""
+    follow, held = session.Run.follow, []
 
     def look(self, phase, error):
         follow(self, phase, error)
-        held.setdefault(phase.stage, []).append("images" in vars(self.dataset))
+        held.append((phase.stage, "images" in vars(self.dataset)))
 
     monkeypatch.setattr(session.Run, "follow", look)
-    start(settings(tiny_scene, tmp_path, checkpoint_every=1000))
-    assert all(held[0]) and held[1][0] and not any(held[1][1:]) and not any(held[2])
+    octree = {**TINY["octree"], "downscales": downscales}
+    start(settings(tiny_scene, tmp_path, octree=octree, checkpoint_every=checkpoint_every))
+    stages, found = zip(*held, strict=True)
+    needed = stages.index(last) + 1
+    assert found == (True,) * needed + (False,) * (60 - needed)
 
 
 def test_a_run_outside_the_main_thread_leaves_signals_alone(tmp_path, tiny_scene):

@@ -187,6 +187,22 @@ def test_tiles_with_a_row_in_a_plane_of_faces(isa):
         assert_within(name, out[name], theirs[name], bounds[name])
 
 
+@pytest.mark.parametrize("widest", [60, 85, 110, 150, 180])
+def test_any_64_rays_from_one_origin_are_correct(isa, widest):
+    """Directions up to so many degrees from an axis, in no order, from inside the cube: no tile of a picture, no pyramid."""
+    rng = np.random.default_rng(widest)
+    octree = random_octree("full", 1, rng)
+    o = (octree.origin + octree.size * rng.uniform(0.2, 0.8, (3, 3))).astype(np.float32)
+    height = rng.uniform(np.cos(np.radians(widest)), 1, 192)
+    around = rng.uniform(0, 2 * np.pi, 192)
+    radius = np.sqrt(1 - height**2)
+    d = unit(np.column_stack([radius * np.cos(around), height, radius * np.sin(around)]))
+    out, theirs = ops.render_rays(octree, o, d, BACKGROUND, 0.0), truth(octree, per_ray(o, 192), d)
+    bounds = rounding.image_bounds(rounding.trace(octree, per_ray(o, 192), d), octree, BACKGROUND)
+    for name in ("rgb", "depth"):
+        assert_within(name, out[name], theirs[name], bounds[name])
+
+
 def test_a_ray_in_a_plane_of_faces_belongs_to_the_box_above(isa):
     """Two leaves side by side, the ray in their common face, then in the outer faces."""
     octree = Octree.from_leaves([1, 1], [[0, 0, 0], [0, 1, 0]], (0, 0, 0), 2.0, 0, 1.0)
