@@ -16,9 +16,9 @@ from nerfvol.errors import InputError
 from nerfvol.machine import available_memory
 from nerfvol.octree import BLOCKS
 
-BASE_BYTES = 300 << 20
-"""The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps:
-measured on lego, from 225 MiB at 0.4 million leaves to 350 at 3 million."""
+BASE_BYTES = 400 << 20
+"""The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
+lego's 5-minute run has at its peak (1.12 GiB) beside the arrays named below."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
