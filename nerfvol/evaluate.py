@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,29 +43,30 @@ def score_views(
     Returns psnr and ssim (means of the per-view values), seconds_per_frame (median) and rows with name, psnr, ssim and
     seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair.
     """
-    rows = []
-    indices, at_once = range(len(dataset)), ops.get_threads()
-    for some in (indices[first : first + at_once] for first in range(0, len(dataset), at_once)):
+
+    def score(rendered: tuple[int, Float, float]) -> dict[str, Any]:
+        index, image, seconds = rendered
+        truth = dataset.composited(index, background)
+        return {
+            "name": dataset.names[index],
+            "psnr": min(psnr(image, truth), LARGEST_PSNR),
+            "ssim": ssim(image, truth),
+            "seconds": seconds,
+        }
+
+    rows, at_once = [], ops.get_threads()
+    for first in range(0, len(dataset), at_once):
         # A few views one after the other, for their times; then their scores side by side.
-        images = {}
-        for index in some:
+        few = []
+        for index in range(first, min(first + at_once, len(dataset))):
             started = time.perf_counter()
             image = render(dataset.cameras[index])
-            images[index] = np.clip(image, 0.0, 1.0), time.perf_counter() - started
-
-        def score(index: int, images: Mapping[int, tuple[Float, float]] = images) -> dict[str, Any]:
-            truth, (image, seconds) = dataset.composited(index, background), images[index]
-            return {
-                "name": dataset.names[index],
-                "psnr": min(psnr(image, truth), LARGEST_PSNR),
-                "ssim": ssim(image, truth),
-                "seconds": seconds,
-            }
-
-        rows += map_threads(score, some, at_once)
+            seconds = time.perf_counter() - started
+            few.append((index, np.clip(image, 0.0, 1.0), seconds))
+        rows += map_threads(score, few, at_once)
         if on_view is not None:
-            for index in some:
-                on_view(index, dataset.composited(index, background), images[index][0])
+            for index, image, _ in few:
+                on_view(index, dataset.composited(index, background), image)
     return {
         "psnr": statistics.fmean(row["psnr"] for row in rows),
         "ssim": statistics.fmean(row["ssim"] for row in rows),

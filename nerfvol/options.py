@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from nerfvol.config import Colour, Count
+from nerfvol.settings import DEFAULT_EARLY_STOP
 
-DEFAULT_EARLY_STOP = 1.0 / 255.0
 AOVS = ("depth", "median_depth", "opacity", "normal")
 
 

@@ -21,9 +21,8 @@ from nerfvol.files import ensure_writable_folder, write_json
 from nerfvol.kernels import ops
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree
-from nerfvol.options import DEFAULT_EARLY_STOP, RenderOptions
-
-WHITE = (1.0, 1.0, 1.0)
+from nerfvol.options import RenderOptions
+from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
 
 Float = NDArray[np.float32]
 

@@ -1,7 +1,7 @@
-"""Settings of the field, of its training and of its distillation.
+"""Settings of the field, of its training and of its distillation, and constants that commands and operators share.
 
-They stand apart from the modules that they steer because those import torch, which costs seconds: every command reads the
-settings, few use a field.
+They stand apart from the modules that they steer because those import torch or numpy, which costs seconds: every command
+reads the settings, few use a field.
 """
 
 from __future__ import annotations
@@ -10,6 +10,11 @@ import dataclasses
 from typing import Literal
 
 from nerfvol.errors import InputError
+
+WHITE = (1.0, 1.0, 1.0)
+"""The background where nobody says another, RGB in [0, 1]."""
+DEFAULT_EARLY_STOP = 1 / 255
+"""Transmittance at which a rendered ray ends: what is behind moves an 8-bit colour by less than one step."""
 
 
 @dataclasses.dataclass(frozen=True)

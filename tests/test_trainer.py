@@ -1,6 +1,7 @@
 """The training run: exact resumption, independence of threads and clock, budgets, interruptions, endings."""
 
 import dataclasses
+import gc
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -246,6 +248,24 @@ def test_the_pictures_are_let_go_once_they_are_in_tiles(
     stages, found = zip(*held, strict=True)
     needed = stages.index(last) + 1
     assert found == (True,) * needed + (False,) * (60 - needed)
+
+
+def test_nothing_of_training_is_held_while_the_result_is_scored(tmp_path, tiny_scene, monkeypatch):
+    trained, save, load = [], trainer.save_octree, trainer.load_octree
+
+    def watch(path, octree, *rest):
+        trained.append(weakref.ref(octree))
+        return save(path, octree, *rest)
+
+    def look(path):
+        gc.collect()
+        assert trained[-1]() is None
+        return load(path)
+
+    monkeypatch.setattr(trainer, "save_octree", watch)
+    monkeypatch.setattr(trainer, "load_octree", look)
+    start(settings(tiny_scene, tmp_path))
+    assert len(trained) == 1
 
 
 def test_a_run_outside_the_main_thread_leaves_signals_alone(tmp_path, tiny_scene):

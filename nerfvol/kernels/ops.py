@@ -90,6 +90,7 @@ def kernel_tree(octree: Octree, values: np.ndarray) -> Any:
 
 
 def check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
+    """Both as contiguous float32; ValueError where they are no rays as the module's head says, or not finite."""
     o, d = (np.ascontiguousarray(a, dtype=np.float32) for a in (rays_o, rays_d))
     if d.ndim != 2 or d.shape[1] != 3:
         raise ValueError(f"rays_d must have shape (n, 3), got {d.shape}")
@@ -102,12 +103,14 @@ def check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_early_stop(eps) -> float:
+    """``eps``; ValueError outside [0, 1)."""
     if not 0 <= eps < 1:  # also refuses NaN
         raise ValueError(f"early_stop_eps must lie in [0, 1), got {eps}")
     return float(eps)
 
 
 def check_background(background) -> list[float]:
+    """Three floats; ValueError where they are not three or not finite."""
     values = [float(x) for x in background]
     if len(values) != 3 or not np.isfinite(values).all():
         raise ValueError(f"background must be three finite numbers, got {background}")
@@ -210,6 +213,7 @@ def _from_tiles(rows: np.ndarray, down: int, across: int) -> np.ndarray:
 
 # ------------------------------------------------------------------ training
 def check_batch(batch: Batch, options: LossOptions) -> tuple[np.ndarray, np.ndarray, list[float], float]:
+    """Origins, directions, background and early-stop threshold; ValueError where the parts of the batch do not fit."""
     o, d = check_rays(batch.rays_o, batch.rays_d)
     if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
         raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")

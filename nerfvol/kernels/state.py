@@ -9,9 +9,7 @@ import numpy as np
 
 from nerfvol.native import aligned, aligned_empty
 from nerfvol.octree import Octree
-
-WHITE = (1.0, 1.0, 1.0)
-DEFAULT_EARLY_STOP = 1 / 255
+from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
 
 
 @dataclass(frozen=True)

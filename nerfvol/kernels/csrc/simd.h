@@ -90,6 +90,7 @@ template <class H> inline Pair<H> select_less(const Pair<H>& x, float limit, con
     return {select_less(x.lo, limit, a.lo, b.lo), select_less(x.hi, limit, a.hi, b.hi)};
 }
 
+// The least of eight numbers.
 inline float least(f8 v) {
     v = vmin(v, __builtin_shufflevector(v, v, 4, 5, 6, 7, 0, 1, 2, 3));
     v = vmin(v, __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5));
@@ -148,7 +149,8 @@ template <int I> inline f4 quarter(const f16& v) {
 inline f16 join(f4 a, f4 b, f4 c, f4 d) { return {{a, b}, {c, d}}; }
 #endif
 
-// Each of v's numbers four times; with the last four as v itself.
+// Each of v's numbers four times: a colour and a raw density over a vertex row. spread_three has v itself in the last quarter,
+// where the second block of degree 2 keeps one coefficient of each channel.
 inline f16 spread(f4 v) {
 #if defined(__AVX512F__)
     return __builtin_shufflevector(v, v, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);

@@ -156,10 +156,12 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         const int count = packets[size_t(i)].second;
         Packet p;
         load_packet(tree, rays, first, first + count, p);
-        if (loss)
+        if (loss) {
+            const uint64_t all = p.alive;
             for (int l = 0; l < count; ++l)
                 if (!(loss->weight[first + l] > 0)) p.alive &= ~(1ull << l);
-        if (loss) bound_packet(p);
+            if (p.alive != all) bound_packet(p);  // without the padding the pyramid is tighter
+        }
         BasisRows<B> basis;
         basis.fill(p, tree.sh_degree);
         PacketState state;
