@@ -1,0 +1,93 @@
+"""Time budgets: every stage gets its share, scoring is paid for, earlier sessions count."""
+
+import json
+import time
+
+import pytest
+from tiny_runs import TINY, Pretended, log_of, settings, start
+
+from nerfvol import cli, runs, session
+from nerfvol.octree_io import load_octree
+
+
+@pytest.mark.parametrize("init", ["direct", "mlp"])
+def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
+    """More steps than fit: by a clock that goes on 20 ms at every look, each phase gets its share and is finished."""
+    looks = iter(range(10**9))
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 0.02 * next(looks))
+    monkeypatch.setattr(session, "FINISH_SECONDS", 100.0)
+    config = settings(tiny_scene, tmp_path, init=init, time_budget=10.0, checkpoint_every=1000)
+    config.octree.steps = config.field.steps = 10**9
+    start(config)
+    metrics = json.loads((tmp_path / runs.METRICS).read_text())
+    log = log_of(tmp_path)
+    assert metrics["psnr"] > 12 and metrics["time_budget"] == 10
+    assert log[-1]["phase"] == "octree" and log[-1]["progress"] >= 1 and log[-1]["stage"] == 2
+    # All of the time but what is kept to finish: 2 seconds here, by the bound on its share.
+    assert log[-1]["seconds"] == pytest.approx(8, abs=0.1)
+    if init == "mlp":
+        assert metrics["stages"]["field"]["seconds"] == pytest.approx(session.FIELD_SHARE * 8, abs=0.1)
+
+
+def test_shares_of_a_budget(tmp_path, tiny_scene, monkeypatch):
+    """100 seconds, 20 of them for the end; a phase that begins at 10 has 70 left, of which the field gets 30 percent."""
+    monkeypatch.setattr(session.Run, "_time_to_finish", lambda self, phase=None: 20.0)
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 13.5)
+    for most, share in ((75.0, 21.0), (7.0, 7.0)):
+        field = {**TINY["field"], "time_budget": most}
+        config = settings(tiny_scene, tmp_path, init="mlp", time_budget=100.0, field=field)
+        run = session.Run(config, session.Clock(0.0, 0.0), None)
+        run.phase_started = 10.0
+        assert run.progress(Pretended("field")) == pytest.approx(3.5 / share)
+        assert run.progress(Pretended("octree")) == pytest.approx(3.5 / 70)
+
+
+def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
+    """By a clock that goes on a second at every look, with a picture that takes 10 more, on one thread.
+
+    A view takes one second to score, and to render a guess of 0.1 microseconds a pixel before there is a picture and 11
+    seconds then. Two views are held out; a tenth is added for what else they need.
+    """
+    seconds = [0.0]
+
+    def look() -> float:
+        seconds[0] += 1
+        return seconds[0]
+
+    def picture(camera):
+        seconds[0] += 10
+
+    monkeypatch.setattr(session.time, "perf_counter", look)
+    cli.set_threads(1)
+    run = session.Run(settings(tiny_scene, tmp_path, time_budget=1000.0), session.Clock(0.0, 0.0), None)
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0)
+    writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 1_000_000
+    octree = Pretended("octree")
+    assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 2.2 * (1 + 1600e-7))
+    octree.picture, octree.stage, octree.trainer, octree.n_leaves = picture, 0, Pretended("trainer"), 3_000_000
+    octree.trainer.bank = None
+    run.enter_stage(octree)
+    writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 3_000_000
+    assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 2.2 * (1 + 11))
+
+
+def test_a_budget_is_kept(tmp_path, tiny_scene):
+    """On the real clock; a step of this scene takes milliseconds."""
+    config = settings(tiny_scene, tmp_path, time_budget=3.0, checkpoint_every=1000)
+    config.octree.steps = 10**9
+    started = time.perf_counter()
+    start(config, started=started)
+    log = log_of(tmp_path)
+    assert log[-1]["progress"] >= 1 and log[-1]["seconds"] > 1.5  # no upper bound: a busy machine may freeze it
+
+
+def test_a_budget_that_is_over_before_the_start(tmp_path, tiny_scene):
+    start(settings(tiny_scene, tmp_path, time_budget=1.0), started=time.perf_counter() - 10)
+    assert json.loads((tmp_path / runs.METRICS).read_text())["steps"] == {"octree": 0}
+    assert load_octree(tmp_path / runs.OCTREE)[0].n_leaves > 0
+
+
+def test_the_time_of_earlier_sessions_counts(tmp_path, tiny_scene):
+    clock = session.Clock(time.perf_counter() - 2, 30.0)
+    assert clock.elapsed() == pytest.approx(32, abs=0.5)
+    assert 0 < session.Clock(None, 0.0).elapsed() < 3600
