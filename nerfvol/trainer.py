@@ -227,8 +227,8 @@ class OctreePhase:
         return render_image(self.trainer.octree, camera, self.background, outputs=("rgb",))["rgb"]
 
     def take_octree(self) -> Octree:
-        """The octree; tiles, moments and statistics are let go."""
-        octree = self.trainer.octree
+        """The finished octree; tiles, moments and statistics are let go."""
+        octree = self.trainer.finished()
         del self.trainer
         return_free_memory()
         return octree

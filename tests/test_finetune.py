@@ -1,5 +1,7 @@
 """Coarse to fine: when leaves go and when they are split."""
 
+import numpy as np
+
 from nerfvol.datasets import load_dataset
 from nerfvol.finetune import OctreeConfig, OctreeTrainer
 
@@ -29,3 +31,39 @@ def test_splitting_stays_within_the_memory(tiny_scene, capsys):
         tuner.step(0.5)
     assert tuner.stage == 1 and tuner.octree.n_leaves <= 6000
     assert "memory allows 6,000 leaves" in capsys.readouterr().out
+
+
+def finished_trainer(tiny_scene, weight_of_needed: float) -> tuple[OctreeTrainer, np.ndarray]:
+    """A trainer after some steps, a third of its leaves emptied, and which of them are needed.
+
+    The empty ones claim a largest weight of 0.015, the others ``weight_of_needed``.
+    """
+    config = OctreeConfig(levels=[4], downscales=[2], until=[1.0], tiles=[16], prunes=[0], prune_steps=8)
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    for _ in range(30):
+        tuner.step(0.5)
+    octree = tuner.octree
+    needed = octree.leaf_ijk[:, 0] < 11
+    octree.density[octree.corners[~needed]] = -60.0
+    tuner.state.max_weight[:] = np.where(needed, weight_of_needed, 0.015)
+    return tuner, needed
+
+
+def test_the_last_pruning_takes_what_no_picture_misses(tiny_scene):
+    """The largest threshold that costs nothing: 0.04 would take what is needed, 0.02 takes the rest, 0.01 nothing."""
+    tuner, needed = finished_trainer(tiny_scene, 0.03)
+    assert ((tuner.finished().query(tuner.octree.leaf_centers()) >= 0) == needed).all()
+
+
+def test_the_last_pruning_leaves_what_pictures_miss(tiny_scene):
+    """In thick media every leaf weighs little: all claim too small a weight, and none may go for it."""
+    tuner, _ = finished_trainer(tiny_scene, 0.001)
+    tuner.state.max_weight[::2] = 1.0  # half would stay
+    assert tuner.finished() is tuner.octree
+
+
+def test_the_last_pruning_needs_to_have_seen_enough(tiny_scene):
+    """Right after a pruning nothing is known of what rays need."""
+    tuner, _ = finished_trainer(tiny_scene, 0.03)
+    tuner.tiles_seen = 0
+    assert tuner.finished() is tuner.octree
