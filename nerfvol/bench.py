@@ -2,7 +2,7 @@
 
 Views are those of the octree's own orbit. Training steps run at learning rate zero on tiles of such views, so that the
 octree under measurement stays what it is while every byte is touched as in training. Coarser octrees for the cost
-against size are made from the given one, level by level.
+against size are the given one cut off at each level (lod.at_level). Pictures are drawn as ``nerfvol render`` does.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from nerfvol import __version__, runs
+from nerfvol import __version__, lod, runs
 from nerfvol.camera_paths import orbit_cameras
 from nerfvol.cameras import Camera, tile_pixels
 from nerfvol.files import ensure_writable_folder, write_json
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware
-from nerfvol.octree import EMPTY_DENSITY, Octree
+from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree
 from nerfvol.options import DEFAULT_EARLY_STOP, BenchOptions, usable_cores
 from nerfvol.render import WHITE, find_orbit, render_image
@@ -115,7 +115,7 @@ def measure_sizes(octree: Octree, cameras: Sequence[Camera], repeats: int) -> li
     """Rendering and training rates of the octree and of coarser versions of it, coarsest first."""
     rows = []
     for level in range(max(5, octree.max_level - 4), octree.max_level + 1):
-        tree = octree if level == octree.max_level else coarsened(octree, level)
+        tree = octree if level == octree.max_level else lod.at_level(octree, level)
         rate, samples = training_rate(tree, cameras, repeats)
         rows.append(
             {
@@ -161,23 +161,6 @@ def _batch(octree: Octree, camera: Camera, seed: int, n_tiles: int) -> ops.Batch
     target = np.clip(image["rgb"].reshape(-1, 3)[chosen] * 0.9, 0.0, 1.0)
     origins = np.broadcast_to(origin, (n_tiles, 3)).copy()
     return ops.Batch(origins, directions[chosen], target, np.ones(len(chosen), np.float32))
-
-
-def coarsened(octree: Octree, level: int) -> Octree:
-    """The octree with no leaf finer than ``level``: new vertices take the mean of the leaf they fall in.
-
-    Good enough to measure speed on a scene of the same shape, no level of detail to look at.
-    """
-    shift = np.maximum(octree.leaf_level - level, 0)
-    cells = np.unique(np.column_stack([octree.leaf_level - shift, octree.leaf_ijk >> shift[:, None]]), axis=0)
-    coarse = Octree.from_leaves(
-        cells[:, 0], cells[:, 1:], octree.origin, octree.size, octree.sh_degree, octree.density_scale
-    )
-    leaf = octree.query(np.clip(coarse.vertex_positions(), octree.origin, octree.origin + octree.size * (1 - 1e-9)))
-    inside = leaf >= 0
-    coarse.values[inside] = octree.values[octree.corners[leaf[inside]]].mean(axis=1)
-    coarse.density[~inside] = EMPTY_DENSITY
-    return coarse
 
 
 def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[str, Any]) -> dict[str, Any]:

@@ -174,6 +174,7 @@ def _eval_arguments(p: _Parser) -> None:
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B (default: that of the training)")
     p.add_argument("--early-stop-eps", metavar="T", help="stop a ray at this transmittance; 0: exact (default: 1/255)")
+    p.add_argument("--lod", metavar="PIXELS", help="draw what is smaller as one cell; 0: every leaf (default: 0.8)")
     p.add_argument("--json", metavar="FILE", help="write scores, per-image rows, seconds per frame and hardware")
     p.add_argument("--save-images", metavar="DIR", help="write truth | render | error | depth for every view")
     p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
@@ -191,6 +192,7 @@ def _render_arguments(p: _Parser) -> None:
     p.add_argument("--fps", metavar="N", help="frames a second of a video (default: 30)")
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B (default: that of the training)")
     p.add_argument("--early-stop-eps", metavar="T", help="stop a ray at this transmittance; 0: exact (default: 1/255)")
+    p.add_argument("--lod", metavar="PIXELS", help="draw what is smaller as one cell; 0: every leaf (default: 0.8)")
 
 
 def _bench_arguments(p: _Parser) -> None:

@@ -313,7 +313,7 @@ def compare(
     rows = []
     for camera, image in zip(smaller.cameras, smaller.pyramid(background, config.compare_downscale), strict=True):
         camera, truth = camera.scaled(config.compare_downscale), image.astype(np.float32) / 255
-        mine = render_image(octree, camera, background, 0.0, ("rgb",))["rgb"]
+        mine = render_image(octree, camera, background, 0.0, ("rgb",), 0.0)["rgb"]
         rows.append([psnr(np.clip(np.asarray(picture), 0, 1), truth) for picture in (render_field(camera), mine)])
     field_psnr, octree_psnr = np.mean(rows, axis=0)
     return float(field_psnr), float(octree_psnr)

@@ -23,7 +23,7 @@ from nerfvol.machine import describe_hardware
 from nerfvol.metrics import psnr, ssim
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree
-from nerfvol.options import DEFAULT_EARLY_STOP, EvalOptions
+from nerfvol.options import DEFAULT_EARLY_STOP, DEFAULT_LOD, EvalOptions
 from nerfvol.render import depth_range, render_image, resolve_background, surface_depth
 
 LARGEST_PSNR = 100.0
@@ -81,11 +81,12 @@ def evaluate_octree(
     background: Sequence[float],
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     on_view: Callable[[int, Float, Float], None] | None = None,
+    lod: float = DEFAULT_LOD,
 ) -> dict[str, Any]:
-    """:func:`score_views` of ``octree``."""
+    """:func:`score_views` of ``octree``, drawn as ``nerfvol render`` draws it (see render.render_image)."""
 
     def render(camera: Camera) -> Float:
-        return render_image(octree, camera, background, early_stop_eps, ("rgb",))["rgb"]
+        return render_image(octree, camera, background, early_stop_eps, ("rgb",), lod)["rgb"]
 
     return score_views(render, dataset, background, on_view)
 
@@ -108,7 +109,7 @@ def run_eval(options: EvalOptions) -> int:
     on_view = None
     if options.save_images is not None:
         on_view = _comparison_writer(Path(options.save_images), octree, dataset, background, options)
-    scores = evaluate_octree(octree, dataset, background, options.early_stop_eps, on_view)
+    scores = evaluate_octree(octree, dataset, background, options.early_stop_eps, on_view, options.lod)
     record = _record(options, scores, str(path), str(data), background, dataset)
     _print_scores(record, options.split)
     if options.truth is not None:
@@ -151,6 +152,7 @@ def _record(
         "split": options.split,
         "downscale": options.downscale,
         "early_stop_eps": options.early_stop_eps,
+        "lod": options.lod,
         "threads": ops.get_threads(),
         "kernel_path": ops.isa(),
         "hardware": describe_hardware(),
@@ -181,7 +183,7 @@ def _comparison_writer(
 
     def write(index: int, truth: Float, image: Float) -> None:
         camera = dataset.cameras[index]
-        geometry = render_image(octree, camera, background, options.early_stop_eps, ("opacity", "depth"))
+        geometry = render_image(octree, camera, background, options.early_stop_eps, ("opacity", "depth"), options.lod)
         depth = pictures.depth_to_grey(surface_depth(geometry), geometry["opacity"], *depths)
         panels = [truth, image, pictures.error_map(truth, image), depth]
         pictures.write_png(folder / f"{dataset.names[index]}.png", pictures.side_by_side(panels))

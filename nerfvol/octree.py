@@ -20,6 +20,7 @@ Laine & Karras, *Efficient Sparse Voxel Octrees* (2010).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,6 +40,9 @@ from nerfvol.topology import (
     pruned_masks,
     renumber_corners,
 )
+
+if TYPE_CHECKING:
+    from nerfvol.lod import Averages
 
 EMPTY_DENSITY = -7.0
 BLOCKS = {0: 1, 1: 1, 2: 2, 3: 4}
@@ -73,8 +77,11 @@ class Octree:
     Attributes: origin (3,) float64; size, density_scale float; sh_degree 0-3; node_mask, leaf_mask (n_nodes,) uint8;
     first_node, first_leaf (n_nodes,) int32; leaf_level (n_leaves,) int8; leaf_ijk (n_leaves, 3) int32;
     corners (n_leaves, 8) int32; values (n_vertices, 16 * blocks) float32, packed rows. The last two begin on a cache
-    line; values that do not are copied when they are assigned.
+    line; values that do not are copied when they are assigned. averages: what nerfvol.lod made of the values, or
+    None; assigning values, density or sh drops it, and whoever writes into ``values`` sets it to None.
     """
+
+    averages: Averages | None = None
 
     def __init__(self, node_mask, leaf_mask, *, origin, size: float, sh_degree: int, density_scale: float):
         """An octree with these masks (n_nodes,), whole numbers in 0..255; values as in :meth:`from_leaves`.
@@ -159,6 +166,7 @@ class Octree:
     @values.setter
     def values(self, rows) -> None:
         self._values = aligned(np.asarray(rows), np.float32)
+        self.averages = None
 
     @property
     def density(self) -> np.ndarray:
@@ -168,6 +176,7 @@ class Octree:
     @density.setter
     def density(self, raw) -> None:
         self.values[:, DENSITY_SLOT] = raw
+        self.averages = None
 
     @property
     def sh(self) -> np.ndarray:
@@ -177,6 +186,7 @@ class Octree:
     @sh.setter
     def sh(self, coefficients) -> None:
         self.values[:, sh_slots(self.sh_degree)] = coefficients
+        self.averages = None
 
     def with_sh_degree(self, degree: int) -> Octree:
         """The same field with another SH degree: missing bands are zero, surplus ones are dropped."""

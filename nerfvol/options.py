@@ -5,12 +5,13 @@ This module imports nothing heavy, so that ``nerfvol --help`` answers at once.
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from nerfvol.config import Colour, Count
-from nerfvol.settings import DEFAULT_EARLY_STOP
+from nerfvol.settings import DEFAULT_EARLY_STOP, DEFAULT_LOD
 
 AOVS = ("depth", "median_depth", "opacity", "normal")
 
@@ -44,6 +45,14 @@ def fraction(value: Any) -> Any:
     return number
 
 
+def pixels(value: Any) -> Any:
+    """A finite number >= 0."""
+    number = float(value)
+    if not 0.0 <= number < math.inf:
+        raise ValueError(f"expected a number of pixels, 0 (off) or more, got {value!r}")
+    return number
+
+
 Size = Annotated[tuple[int, int], image_size]
 
 
@@ -57,6 +66,7 @@ class EvalOptions:
     downscale: Count = 1
     background: Colour | None = None
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
+    lod: Annotated[float, pixels] = DEFAULT_LOD
     json: str | None = None
     save_images: str | None = None
     truth: str | None = None
@@ -77,6 +87,7 @@ class RenderOptions:
     fps: Count = 30
     background: Colour | None = None
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
+    lod: Annotated[float, pixels] = DEFAULT_LOD
     threads: int = 0
 
 

@@ -22,7 +22,7 @@ from nerfvol.kernels import ops
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree
 from nerfvol.options import RenderOptions
-from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
+from nerfvol.settings import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
 
 Float = NDArray[np.float32]
 
@@ -33,14 +33,18 @@ def render_image(
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = ops.OUTPUTS,
+    lod: float = DEFAULT_LOD,
 ) -> dict[str, Float]:
     """One view: float32 arrays (H, W, 3) or (H, W) for the names in ``outputs`` (see ops.render_rays).
 
-    ``rgb`` is not clipped.
+    ``rgb`` is not clipped. A node of the octree that is smaller than ``lod`` pixels in the middle of the picture stands in
+    for its leaves; 0: none does. ValueError where ``lod`` is negative or not finite.
     """
+    if not 0 <= lod < np.inf:
+        raise ValueError(f"lod must be a number of pixels, 0 or more and finite, got {lod}")
     lens = camera.intrinsics
-    size = (lens.height, lens.width)
-    return ops.render_view(octree, _tiled_directions(lens), camera.c2w, size, background, early_stop_eps, outputs)
+    view = ops.View(_tiled_directions(lens), camera.c2w, lens.height, lens.width)
+    return ops.render_view(octree, view, background, early_stop_eps, outputs, lod / max(lens.fx, lens.fy))
 
 
 @functools.lru_cache(maxsize=1)
@@ -155,7 +159,7 @@ def _frames(
     for index, camera in enumerate(cameras):
         if sys.stderr.isatty():
             print(f"\rview {index + 1}/{len(cameras)}", end="", file=sys.stderr, flush=True)
-        image = render_image(octree, camera, background, options.early_stop_eps, outputs)
+        image = render_image(octree, camera, background, options.early_stop_eps, outputs, options.lod)
         if "depth" in options.aov:
             image["depth"] = surface_depth(image)
         if "normal" in options.aov:

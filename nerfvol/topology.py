@@ -108,23 +108,37 @@ def build_masks(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def pruned_masks(node_mask: np.ndarray, leaf_mask: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Masks of the octree without the leaves where ``keep`` (n_leaves,) is false; at least one must stay."""
-    leaves = _bits(leaf_mask)
+    leaves = bits_of(leaf_mask)
     leaves[leaves] = keep
     leaf_mask = np.packbits(leaves, axis=1, bitorder="little")[:, 0]
-    starts = [0, 1]  # of the levels
-    while starts[-1] < len(node_mask):
-        starts.append(starts[-1] + int(POPCOUNT[node_mask[starts[-2] : starts[-1]]].sum()))
+    starts = level_starts(node_mask)
     node_mask, alive = node_mask.copy(), leaf_mask != 0
     for i in range(len(starts) - 3, -1, -1):
         level, below = slice(starts[i], starts[i + 1]), slice(starts[i + 1], starts[i + 2])
-        nodes = _bits(node_mask[level])
+        nodes = bits_of(node_mask[level])
         nodes[nodes] = alive[below]
         node_mask[level] = np.packbits(nodes, axis=1, bitorder="little")[:, 0]
         alive[level] |= node_mask[level] != 0
     return node_mask[alive], leaf_mask[alive]
 
 
-def _bits(mask: np.ndarray) -> np.ndarray:
+def level_starts(node_mask: np.ndarray) -> list[int]:
+    """Where the nodes of each level begin, from the root's, and behind them where the last level ends."""
+    starts = [0, 1]
+    while starts[-1] < len(node_mask):
+        starts.append(starts[-1] + int(POPCOUNT[node_mask[starts[-2] : starts[-1]]].sum()))
+    return starts
+
+
+def place_nodes(node_mask: np.ndarray, starts: list[int]) -> np.ndarray:
+    """Positions (n_nodes, 3) int32 of the nodes, each in units of its side; starts as :func:`level_starts` has them."""
+    codes = [np.zeros(1, dtype=np.int64)]
+    for start, end in zip(starts[:-2], starts[1:-1], strict=True):
+        codes.append((codes[-1][:, None] * 8 + np.arange(8))[bits_of(node_mask[start:end])])
+    return demorton(np.concatenate(codes)).astype(np.int32)
+
+
+def bits_of(mask: np.ndarray) -> np.ndarray:
     """(n,) uint8 as (n, 8) bool, lowest bit first."""
     return np.unpackbits(mask[:, None], axis=1, bitorder="little").view(bool)
 
@@ -156,10 +170,10 @@ def place_leaves(node_mask: np.ndarray, leaf_mask: np.ndarray) -> tuple[np.ndarr
     codes = np.zeros(1, dtype=np.int64)  # of the nodes in [start, end), all of one level
     for depth in range(1, MAX_LEVEL + 1):
         child = codes[:, None] * 8 + np.arange(8)
-        leaves = child[_bits(leaf_mask[start:end])]
+        leaves = child[bits_of(leaf_mask[start:end])]
         level.append(np.full(len(leaves), depth, dtype=np.int8))
         ijk.append(demorton(leaves).astype(np.int32))
-        codes = child[_bits(node_mask[start:end])]
+        codes = child[bits_of(node_mask[start:end])]
         if not len(codes):
             break
         start, end = end, end + len(codes)

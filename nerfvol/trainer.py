@@ -223,8 +223,8 @@ class OctreePhase:
         return report.squared_error, report.samples
 
     def picture(self, camera: Camera) -> np.ndarray:
-        """(H, W, 3) as the camera sees the octree."""
-        return render_image(self.trainer.octree, camera, self.background, outputs=("rgb",))["rgb"]
+        """(H, W, 3) as the camera sees the leaves: averages would be made anew for each picture."""
+        return render_image(self.trainer.octree, camera, self.background, outputs=("rgb",), lod=0.0)["rgb"]
 
     def take_octree(self) -> Octree:
         """The finished octree; tiles, moments and statistics are let go."""

@@ -24,17 +24,6 @@ def test_median_does_not_count_the_first_call(monkeypatch):
     assert calls == [0, 0, 1, 2]
 
 
-def test_coarsened_octree_covers_the_same_leaves():
-    octree = make_sphere_octree(5)
-    coarse = bench.coarsened(octree, 3)
-    coarse.validate()
-    assert coarse.max_level == 3 and coarse.n_leaves < octree.n_leaves
-    assert np.all(coarse.query(octree.leaf_centers()) >= 0)  # nothing lost
-    assert np.all(np.bincount(coarse.query(octree.leaf_centers()), minlength=coarse.n_leaves) > 0)  # nothing added
-    same = bench.coarsened(octree, 9)
-    assert np.array_equal(same.leaf_ijk, octree.leaf_ijk)
-
-
 def test_training_rate_leaves_the_octree_as_it_is(cameras):
     octree = make_sphere_octree(4)
     before = octree.values.copy()

@@ -18,7 +18,7 @@ LAYERS: dict[int, set[str]] = {
         "lens", "cameras", "sh", "quadrature", "sampling", "losses", "metrics",
     },
     # representations
-    1: {"settings", "encodings", "fields", "occupancy", "topology", "octree", "octree_codec", "octree_io", "merge"},
+    1: {"settings", "encodings", "fields", "occupancy", "topology", "octree", "octree_codec", "octree_io", "merge", "lod"},
     # operators on rays and octrees
     2: {"kernels"},
     # use: data in, training, pictures and records out

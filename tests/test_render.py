@@ -37,7 +37,7 @@ def test_every_pixel_is_its_own_ray(sphere_octree, monkeypatch, size, path):
     with monkeypatch.context() as patch:
         if path == "reference":
             patch.setattr(ops, "native", lambda: None)
-        image = render.render_image(sphere_octree, camera, (0.2, 0.4, 0.6), 0.0)
+        image = render.render_image(sphere_octree, camera, (0.2, 0.4, 0.6), 0.0, lod=0.0)
     origin, directions = camera.rays()
     expected = ops.render_rays(
         sphere_octree, np.broadcast_to(origin, directions.shape).copy(), directions, (0.2, 0.4, 0.6), 0.0

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from nerfvol.kernels.state import DEFAULT_EARLY_STOP, WHITE, Batch, LossOptions, Rates, StepReport, TrainState
+from nerfvol import lod
+from nerfvol.kernels.state import DEFAULT_EARLY_STOP, WHITE, Batch, LossOptions, Rates, StepReport, TrainState, View
 from nerfvol.native import native
 from nerfvol.octree import BLOCKS, Octree
 
@@ -68,13 +69,17 @@ if native() is not None and "NERFVOL_ISA" in os.environ:
     set_isa(os.environ["NERFVOL_ISA"])
 
 
-def kernel_tree(octree: Octree, values: np.ndarray) -> Any:
-    """The kernels' view of ``octree`` with ``values`` (n_vertices, row) in place of its own."""
+def kernel_tree(octree: Octree, values: np.ndarray, coarse: float = 0.0) -> Any:
+    """The kernels' view of ``octree`` with ``values`` (n_vertices, row) in place of its own.
+
+    Where ``coarse`` > 0, nodes whose side is below ``coarse`` times their distance stand in for their leaves.
+    """
     compiled = native()
     assert compiled is not None
     shape = (octree.n_vertices, 16 * BLOCKS[octree.sh_degree])
     if values.shape != shape or values.dtype != np.float32:
         raise ValueError(f"the octree's values must be float32 {shape}, got {values.dtype} {values.shape}")
+    averages = lod.node_averages(octree) if coarse > 0 else None
     return compiled.Tree(
         octree.node_mask,
         octree.leaf_mask,
@@ -86,6 +91,9 @@ def kernel_tree(octree: Octree, values: np.ndarray) -> Any:
         [float(x) for x in octree.origin],
         octree.size,
         octree.density_scale,
+        averages and averages.corners,
+        averages and averages.values,
+        coarse,
     )
 
 
@@ -107,6 +115,13 @@ def check_early_stop(eps) -> float:
     if not 0 <= eps < 1:  # also refuses NaN
         raise ValueError(f"early_stop_eps must lie in [0, 1), got {eps}")
     return float(eps)
+
+
+def check_coarse(octree: Octree, origins: np.ndarray, coarse) -> float:
+    """``coarse``, or 0 where no node is so small from any of ``origins``; ValueError where it is negative or not finite."""
+    if not 0 <= coarse < np.inf:
+        raise ValueError(f"coarse must be an angle in radians, 0 or more and finite, got {coarse}")
+    return float(coarse) if coarse > 0 and lod.may_stand_in(octree, origins, coarse) else 0.0
 
 
 def check_background(background) -> list[float]:
@@ -134,40 +149,38 @@ def render_rays(
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
+    coarse: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Renders rays.
 
     Returns float32 arrays for the names in ``outputs``: rgb (n, 3) over ``background``, opacity 1 - T (n,), depth
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
-    by less than that; 0 is exact.
+    by less than that; 0 is exact. A node whose side is below ``coarse`` times the distance of its centre from the ray's
+    origin stands in for its leaves (nerfvol.lod); 0: none does.
     """
     o, d = check_rays(rays_o, rays_d)
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
     _check_outputs(outputs)
+    coarse = check_coarse(octree, o, coarse)
     if (compiled := native()) is None:
-        return _on_torch().render_rays(octree, o, d, bg, eps, outputs)
+        return _on_torch().render_rays(octree, o, d, bg, eps, outputs, coarse)
     out = _empty_outputs(outputs, (len(d),))
-    tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
+    tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32), coarse)
     compiled.render(tree, o, d, bg, eps, *(out.get(name) for name in OUTPUTS))
     return _finished(out)
 
 
 def render_view(
     octree: Octree,
-    directions: np.ndarray,
-    camera_to_world: np.ndarray,
-    size: tuple[int, int],
+    view: View,
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
+    coarse: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Renders a camera's picture of ``size`` (height, width); results as in :func:`render_rays`, (height, width[, 3]).
-
-    directions: (tile rows, tile columns, 3, 64) float32 unit directions in camera axes, a row of 64 for each 8x8 tile;
-    tiles at the right and lower edge may reach beyond the picture. camera_to_world: (4, 4), or (3, 4).
-    """
-    height, width = size
+    """Renders a camera's picture; results as in :func:`render_rays`, (height, width[, 3])."""
+    directions, camera_to_world, height, width = view.directions, view.camera_to_world, view.height, view.width
     tiles = (-(-height // 8), -(-width // 8), 3, TILE)
     if directions.shape != tiles or directions.dtype != np.float32 or not directions.flags.c_contiguous:
         raise ValueError(f"directions must be float32 {tiles}, got {directions.dtype} {directions.shape}")
@@ -176,13 +189,14 @@ def render_view(
         raise ValueError("camera_to_world must be finite")
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
     _check_outputs(outputs)
+    coarse = check_coarse(octree, origin, coarse)
     if (compiled := native()) is None:
         flat = directions.swapaxes(2, 3).reshape(-1, 3) @ rotation.T.astype(np.float32)
         origins = np.broadcast_to(origin, (len(flat) // TILE, 3)).copy()
-        rays = _on_torch().render_rays(octree, origins, flat, bg, eps, outputs)
+        rays = _on_torch().render_rays(octree, origins, flat, bg, eps, outputs, coarse)
         return {name: _from_tiles(rows, tiles[0], tiles[1])[:height, :width] for name, rows in rays.items()}
     out = _empty_outputs(outputs, (height, width))
-    tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32))
+    tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32), coarse)
     frame = (rotation.ravel().tolist(), origin.tolist(), height, width)
     compiled.render_view(tree, directions, *frame, bg, eps, *(out.get(name) for name in OUTPUTS))
     return _finished(out)
@@ -229,6 +243,7 @@ def train_step(
     """
     o, d, bg, eps = check_batch(batch, options)
     state.check(octree)
+    octree.averages = None
     if (compiled := native()) is None:
         return _on_torch().train_step(octree, state, batch, options, rates, pixel_angle)
     squared, weight, samples = compiled.train_step(

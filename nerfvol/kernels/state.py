@@ -13,6 +13,20 @@ from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
 
 
 @dataclass(frozen=True)
+class View:
+    """A camera's picture of height x width pixels.
+
+    directions: (tile rows, tile columns, 3, 64) float32 unit directions in camera axes, a row of 64 for each 8x8 tile;
+    tiles at the right and lower edge may reach beyond the picture. camera_to_world: (4, 4), or (3, 4).
+    """
+
+    directions: np.ndarray
+    camera_to_world: np.ndarray
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
 class Batch:
     """Tiles of training rays. rays_o (n_tiles, 3); rays_d, target (64 n_tiles, 3); weight (64 n_tiles,), 0 = padding."""
 

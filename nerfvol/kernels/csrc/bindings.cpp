@@ -34,13 +34,20 @@ struct TreeArrays {
     In<int32_t, nb::ndim<1>> first_node, first_leaf;
     In<int32_t, nb::shape<-1, 8>> corners;
     Rows values;
+    Maybe<In<int32_t, nb::shape<-1, 8>>> node_corners;
+    Maybe<Rows> node_values;
     Tree tree;
 };
 
 void init_tree(TreeArrays* self, In<uint8_t, nb::ndim<1>> node_mask, In<uint8_t, nb::ndim<1>> leaf_mask,
                In<int32_t, nb::ndim<1>> first_node, In<int32_t, nb::ndim<1>> first_leaf, In<int32_t, nb::shape<-1, 8>> corners,
-               Rows values, int sh_degree, std::vector<float> origin, float size, float density_scale) {
-    auto* t = new (self) TreeArrays{node_mask, leaf_mask, first_node, first_leaf, corners, values, {}};
+               Rows values, int sh_degree, std::vector<float> origin, float size, float density_scale,
+               Maybe<In<int32_t, nb::shape<-1, 8>>> node_corners, Maybe<Rows> node_values, float coarse) {
+    if (coarse > 0 && (!node_corners || !node_values || node_corners->shape(0) != node_mask.shape(0) ||
+                       node_values->shape(1) != values.shape(1)))
+        throw std::invalid_argument("coarse cells need averages for every node");
+    auto* t = new (self)
+        TreeArrays{node_mask, leaf_mask, first_node, first_leaf, corners, values, node_corners, node_values, {}};
     Tree& v = t->tree;
     v.node_mask = node_mask.data();
     v.leaf_mask = leaf_mask.data();
@@ -56,6 +63,9 @@ void init_tree(TreeArrays* self, In<uint8_t, nb::ndim<1>> node_mask, In<uint8_t,
     for (int k = 0; k < 3; ++k) v.origin[k] = origin.at(size_t(k));
     v.size = size;
     v.density_scale = density_scale;
+    v.node_corners = pointer(node_corners);
+    v.node_values = pointer(node_values);
+    v.coarse = coarse;
 }
 
 Rays make_rays(const Rows& origins, const Rows& directions) {
@@ -163,6 +173,16 @@ void py_interpolate(Rows rows, In<int32_t, nb::shape<-1, 8>> corners, In<int32_t
                 out.data());
 }
 
+void py_restrict_cells(In<uint8_t, nb::ndim<1>> mask, In<int32_t, nb::ndim<1>> first, In<int32_t, nb::shape<-1, 8>> corners,
+                       Rows rows, In<float, nb::ndim<1>> weight, int64_t density, Out<float, nb::shape<-1, 8, -1>> sums) {
+    if (sums.shape(0) != mask.shape(0) || first.shape(0) != mask.shape(0) || sums.shape(2) != rows.shape(1) ||
+        weight.shape(0) != rows.shape(0) || density < 0 || density >= int64_t(rows.shape(1)))
+        throw std::invalid_argument("the sums do not fit the nodes or the rows");
+    nb::gil_scoped_release release;
+    restrict_cells(mask.data(), first.data(), int64_t(mask.shape(0)), corners.data(), rows.data(), int64_t(rows.shape(1)),
+                   weight.data(), density, sums.data());
+}
+
 void py_gather_tiles(const std::vector<In<float, nb::shape<-1, 64, 3>>>& directions,
                      const std::vector<In<uint8_t, nb::shape<-1, 64, 3>>>& pixels, In<float, nb::shape<-1, 3, 3>> rotations,
                      In<int64_t, nb::ndim<1>> image, In<int64_t, nb::ndim<1>> tile, Out<float, nb::shape<-1, 64, 3>> out,
@@ -193,7 +213,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     nb::class_<TreeArrays>(m, "Tree").def(
         "__init__", &init_tree,
         "node_mask"_a, "leaf_mask"_a, "first_node"_a, "first_leaf"_a, "corners"_a, "values"_a, "sh_degree"_a, "origin"_a, "size"_a,
-        "density_scale"_a);
+        "density_scale"_a, "node_corners"_a.none(), "node_values"_a.none(), "coarse"_a);
     m.def("render", &py_render, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(),
           "trans"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none());
     m.def("render_view", &py_render_view, "tree"_a, "directions"_a, "rotation"_a, "origin"_a, "height"_a, "width"_a,
@@ -209,6 +229,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);
     m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);
     m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
+    m.def("restrict_cells", &py_restrict_cells, "mask"_a, "first"_a, "corners"_a, "rows"_a, "weight"_a, "density"_a, "sums"_a);
     m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "out"_a, "target"_a);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);

@@ -60,9 +60,9 @@ template <int B, class Sink> void march(const Tree& tree, Packet& p, Sink&& sink
     Leaf queue[kAhead];
     uint32_t found = 0, asked = 0, used = 0;
     const auto ask = [&] {
-        const int32_t* c = tree.corners + 8 * int64_t(queue[asked++ % kAhead].index);
+        const Cell c = cell(tree, queue[asked++ % kAhead].index);
         for (int o = 0; o < 8; ++o)
-            for (int k = 0; k < B; ++k) __builtin_prefetch(tree.values + 16 * (B * int64_t(c[o]) + k));
+            for (int k = 0; k < B; ++k) __builtin_prefetch(c.values + 16 * (B * int64_t(c.corners[o]) + k));
     };
     Segments segments;
     for (;;) {
@@ -78,7 +78,8 @@ template <int B, class Sink> void march(const Tree& tree, Packet& p, Sink&& sink
         if (!leaf.rays) continue;
         const uint64_t hits = intersect(p, leaf, segments);
         if (!hits) continue;
-        sink(leaf, hits, segments, LeafField<B>(tree.values, tree.corners + 8 * int64_t(leaf.index)));
+        const Cell c = cell(tree, leaf.index);
+        sink(leaf, hits, segments, LeafField<B>(c.values, c.corners));
     }
 }
 

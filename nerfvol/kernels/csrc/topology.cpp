@@ -30,6 +30,17 @@ int lattice_place(int octant, int corner) {
     return place;
 }
 
+// Trilinear weights of the lattice's points at the leaf's corners.
+void lattice_weights(float weights[27][8]) {
+    for (int p = 0; p < 27; ++p)
+        for (int o = 0; o < 8; ++o) {
+            const int at[3] = {p / 9, p / 3 % 3, p % 3};
+            weights[p][o] = 1;
+            for (int axis = 0; axis < 3; ++axis)
+                weights[p][o] *= 0.5f * float((o >> (2 - axis) & 1) ? at[axis] : 2 - at[axis]);
+        }
+}
+
 bool is_lattice_corner(int place) { return (place / 9) % 2 == 0 && (place / 3) % 3 % 2 == 0 && place % 3 % 2 == 0; }
 
 }  // namespace
@@ -100,13 +111,7 @@ void find_sources(const int32_t* corners, const int32_t* parent, const int8_t* o
 void interpolate(const float* rows, int64_t width, const int32_t* old_corners, const int32_t* source, const int8_t* place,
                  int64_t n_vertices, float* out) {
     float weights[27][8];
-    for (int p = 0; p < 27; ++p)
-        for (int o = 0; o < 8; ++o) {
-            const int at[3] = {p / 9, p / 3 % 3, p % 3};
-            weights[p][o] = 1;
-            for (int axis = 0; axis < 3; ++axis)
-                weights[p][o] *= 0.5f * float((o >> (2 - axis) & 1) ? at[axis] : 2 - at[axis]);
-        }
+    lattice_weights(weights);
     constexpr int64_t kChunk = 16384;
     parallel_for(int((n_vertices + kChunk - 1) / kChunk), [&](int chunk, int) {
         for (int64_t v = chunk * kChunk; v < n_vertices && v < (chunk + 1) * kChunk; ++v) {
@@ -117,6 +122,34 @@ void interpolate(const float* rows, int64_t width, const int32_t* old_corners, c
                 if (w == 0) continue;
                 const float* from = rows + width * old_corners[8 * int64_t(source[v]) + o];
                 for (int64_t k = 0; k < width; ++k) row[k] += w * from[k];
+            }
+        }
+    });
+}
+
+void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const int32_t* corners, const float* rows,
+                    int64_t width, const float* weight, int64_t density, float* sums) {
+    float weights[27][8];
+    lattice_weights(weights);
+    constexpr int64_t kChunk = 1024;
+    parallel_for(int((n + kChunk - 1) / kChunk), [&](int chunk, int) {
+        std::vector<float> row(std::size_t(width), 0.0f);
+        for (int64_t node = chunk * kChunk; node < n && node < (chunk + 1) * kChunk; ++node) {
+            const int32_t* child = corners + 8 * int64_t(first[node]);
+            for (int octant = 0; octant < 8; ++octant) {
+                if (!(mask[node] >> octant & 1)) continue;
+                for (int c = 0; c < 8; ++c) {
+                    const int64_t v = child[c];
+                    for (int64_t k = 0; k < width; ++k) row[std::size_t(k)] = weight[v] * rows[width * v + k];
+                    row[std::size_t(density)] = weight[v];
+                    for (int o = 0; o < 8; ++o) {
+                        const float w = 0.125f * weights[lattice_place(octant, c)][o];
+                        float* to = sums + width * (8 * node + o);
+                        if (w == 0) continue;
+                        for (int64_t k = 0; k < width; ++k) to[k] += w * row[std::size_t(k)];
+                    }
+                }
+                child += 8;
             }
         }
     });

@@ -26,12 +26,24 @@ struct Packet {
     struct Grid { float low, high, per_step; } columns, rows;  // see bound_grid
 };
 
-// A leaf on the packet's way: its smallest corner, its side and the rays that may meet it.
+// A leaf on the packet's way, or a node in place of its leaves (see Cell): its smallest corner, its side and the rays that
+// may meet it.
 struct Leaf {
     int32_t index;
     float x, y, z, side;
     uint64_t rays;
 };
+
+// What a ray crosses: leaf `index`, or node `index - n_leaves` that stands in for its leaves.
+struct Cell {
+    const int32_t* corners;
+    const float* values;
+};
+
+inline Cell cell(const Tree& t, int32_t index) {
+    if (index < t.n_leaves) return {t.corners + 8 * int64_t(index), t.values};
+    return {t.node_corners + 8 * (index - t.n_leaves), t.node_values};
+}
 
 // 1/d; a zero component counts as +1e-20, which makes boxes half-open: a ray in the plane of a face belongs to the box
 // above the face and to no other.
@@ -139,7 +151,7 @@ inline void bound_packet(Packet& p) {
     p.bounded = true;
 }
 
-struct Entry {  // on the stack: interior node `index`, or leaf `~index`
+struct Entry {  // on the stack: interior node `index` to be opened, or cell `~index`
     int32_t index;
     float x, y, z, side;
     uint64_t rays;
@@ -231,6 +243,14 @@ public:
     }
 
 private:
+    // Whether a node is so small, seen from the packet's origin, that it is not opened. The directions have no say: every
+    // ray from one point sees the same cells.
+    bool stands_in(float x, float y, float z, float side) const {
+        if (!(tree_.coarse > 0)) return false;
+        const float h = 0.5f * side, to[3] = {x + h - p_.o[0], y + h - p_.o[1], z + h - p_.o[2]};
+        return side * side < tree_.coarse * tree_.coarse * dot3(to, to);
+    }
+
     void expand(const Entry& e, uint64_t rays) {
         const float h = 0.5f * e.side;
         const uint32_t nodes = tree_.node_mask[e.index], leaves = tree_.leaf_mask[e.index];
@@ -254,12 +274,14 @@ private:
         while (waiting) {  // pushed back to front
             const uint32_t k = 31 - uint32_t(__builtin_clz(waiting)), o = first ^ k, bit = 1u << o;
             waiting ^= 1u << k;
+            const float x = e.x + (o & 4 ? h : 0.0f), y = e.y + (o & 2 ? h : 0.0f), z = e.z + (o & 1 ? h : 0.0f);
             const bool is_leaf = leaves & bit;
             const int32_t leaf = first_leaf + __builtin_popcount(leaves & (bit - 1));
             const int32_t node = first_node + __builtin_popcount(nodes & (bit - 1));
-            __builtin_prefetch(is_leaf ? static_cast<const void*>(tree_.corners + 8 * int64_t(leaf)) : tree_.first_leaf + node);
-            stack_[n_++] = {is_leaf ? ~leaf : node, e.x + (o & 4 ? h : 0.0f), e.y + (o & 2 ? h : 0.0f),
-                            e.z + (o & 1 ? h : 0.0f), h, inside[o]};
+            const bool is_cell = is_leaf || stands_in(x, y, z, h);
+            const int32_t index = is_leaf ? leaf : int32_t(tree_.n_leaves) + node;
+            __builtin_prefetch(is_cell ? static_cast<const void*>(cell(tree_, index).corners) : tree_.first_leaf + node);
+            stack_[n_++] = {is_cell ? ~index : node, x, y, z, h, inside[o]};
         }
     }
 

@@ -19,6 +19,9 @@ struct Tree {
     int sh_degree;
     float origin[3], size;                       // root cube, scene units
     float density_scale;                         // 1 / scene unit
+    const int32_t* node_corners;                 // (n_nodes, 8) rows of node_values; null where averages are not used
+    const float* node_values;                    // what stands in for everything below a node (nerfvol/lod.py)
+    float coarse;                                // a node does where its side is below this many times its distance; 0: none
 };
 
 struct Rays {
