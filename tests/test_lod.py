@@ -1,0 +1,261 @@
+"""Level of detail: averages of nodes, and pictures in which nodes stand in for their leaves."""
+
+import math
+
+import numpy as np
+import pytest
+
+from nerfvol import lod, native
+from nerfvol.cameras import Camera, Intrinsics, look_at
+from nerfvol.kernels import ops
+from nerfvol.octree import DENSITY_SLOT, OFFSETS, Octree, explin, explin_inverse
+from nerfvol.render import render_image
+from nerfvol.topology import level_starts, place_nodes
+from tests.kernels.trees import camera_tiles, random_octree
+
+
+def cube(level: int, scale: float = 1.0, degree: int = 1) -> Octree:
+    """Every cell of ``level`` in [-1, 1]^3."""
+    ijk = np.argwhere(np.ones([2**level] * 3))
+    return Octree.from_leaves(np.full(len(ijk), level), ijk, (-1, -1, -1), 2.0, degree, scale)
+
+
+def camera_at(position, size: int, target=(0.0, 0.0, 0.0), focal: float = 1.0) -> Camera:
+    """Looks at ``target``; focal length ``focal`` x the picture's width."""
+    lens = Intrinsics(size, size, focal * size, focal * size, size / 2, size / 2)
+    return Camera(lens, look_at(np.asarray(position, float), np.asarray(target, float), (0.0, 0.0, 1.0)))
+
+
+def sides_and_centres(octree: Octree) -> tuple[np.ndarray, np.ndarray]:
+    """Of the nodes: (n_nodes,), (n_nodes, 3)."""
+    starts = level_starts(octree.node_mask)
+    side = octree.size / 2.0 ** np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    return side, octree.origin + (place_nodes(octree.node_mask, starts) + 0.5) * side[:, None]
+
+
+# ------------------------------------------------------------------ averages
+@pytest.mark.parametrize("pixels", [0.0, 0.5, 2.0, 1e6])
+def test_a_constant_cube_is_exp_minus_sigma_l_at_any_level_of_detail(pixels):
+    octree = cube(4)
+    octree.density, octree.sh = 0.4, np.array([0.5, -0.2, 0.1])[:, None] * (np.arange(4) == 0)
+    camera = camera_at((2.9, 1.7, 1.1), 24)
+    image = render_image(octree, camera, (0, 0, 0), 0.0, lod=pixels)
+    origin, d = (a.astype(np.float64) for a in camera.rays())
+    a, b = (-1 - origin) / d, (1 - origin) / d
+    length = np.maximum(np.minimum(np.maximum(a, b).min(1), 1e9) - np.minimum(a, b).max(1), 0)
+    opacity = 1 - np.exp(-float(explin(np.float32(0.4))) * length).reshape(24, 24)
+    colour = 0.5 + 0.28209479177387814 * np.array([0.5, -0.2, 0.1])
+    # Up to 40 segments: each moves an optical depth by some roundings of float32, an average by some more.
+    np.testing.assert_allclose(image["opacity"], opacity, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(image["rgb"], opacity[..., None] * colour, rtol=0, atol=2e-5)
+
+
+def test_inner_corners_of_nodes_carry_a_linear_field():
+    """Thin: opacity is optical depth to 1e-4, and the weights are symmetric around a corner with all its nodes."""
+    octree = cube(4, scale=1e-5)
+    slope = np.array([1.0, -0.5, 0.25])
+    octree.density = explin_inverse(4 + octree.vertex_positions() @ slope)
+    octree.sh = (octree.vertex_positions() @ slope)[:, None, None] * np.ones((1, 3, 4))
+    averages = lod.node_averages(octree)
+    side, centre = sides_and_centres(octree)
+    place = centre[:, None] + (OFFSETS - 0.5) * side[:, None, None]
+    inner = (np.abs(place) < 0.99).all(-1)
+    assert len(np.unique(np.repeat(side[:, None], 8, 1)[inner])) == 3  # levels 1 to 3
+    sigma = explin(averages.values[averages.corners][..., DENSITY_SLOT])
+    np.testing.assert_allclose(sigma[inner], (4 + place @ slope)[inner], rtol=1e-4)
+
+
+def test_colour_is_weighted_by_opacity():
+    """Opaque red below, clear green above: the root, over both, is red and never grey."""
+    octree = cube(2, scale=100.0, degree=0)
+    low = octree.vertex_positions()[:, 2] < 0
+    octree.density = np.where(low, 3.0, -20.0)
+    octree.sh = np.where(low[:, None], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0])[:, :, None]
+    averages = lod.node_averages(octree)
+    red = averages.values[averages.corners[0]][:, [0, 4, 8]]
+    np.testing.assert_allclose(red, np.broadcast_to([1, -1, -1], red.shape), atol=1e-4)
+
+
+def test_averages_conserve_thin_matter():
+    """Parallel rays on a symmetric grid see the mean optical depth, whatever the cells; second order in the depth."""
+    octree = cube(3, scale=2e-3, degree=0)
+    octree.density = np.random.default_rng(0).uniform(1, 3, octree.n_vertices)
+    grid = (np.arange(64) + 0.5) / 32 - 1
+    y, z = (g.ravel() for g in np.meshgrid(grid, grid))
+    o = np.stack([np.full(4096, -50.0), y, z], 1).astype(np.float32)
+    d = np.broadcast_to(np.float32([1, 0, 0]), o.shape).copy()
+    depth = [
+        -np.log1p(-ops.render_rays(octree, o, d, early_stop_eps=0.0, outputs=("opacity",), coarse=c)["opacity"]).mean()
+        for c in (0.0, 0.011, 0.021, 1.0)  # nodes of level 2, 1, 1
+    ]
+    assert lod.standing_in(octree, (-50, 0, 0), 0.011).sum() == 64
+    assert not lod.standing_in(octree, (-50, 0, 0), 1.0)[0]  # the root is always opened
+    deepest = 3 * 2e-3 * 2
+    np.testing.assert_allclose(depth, depth[0], rtol=deepest)
+    assert depth[1] != depth[0]
+
+
+def test_walls_stay_opaque_and_edges_where_they_are():
+    """A wall one leaf thick over half of the cube, seen square on, in cells twice and four times the leaf's side."""
+    octree = cube(5, scale=400.0, degree=0)
+    wall = (octree.leaf_ijk[:, 0] == 15) & (octree.leaf_ijk[:, 1] < 16)
+    octree, _ = octree.prune(wall)
+    octree.density = 1.0  # an optical depth of 25
+    y, z = (g.ravel() for g in np.meshgrid((np.arange(128) + 0.5) / 64 - 1, (np.arange(8) + 0.5) / 10))
+    o = np.stack([np.full(y.shape, -100.0), y, z], 1).astype(np.float32)
+    d = np.broadcast_to(np.float32([1, 0, 0]), o.shape).copy()
+    for cells in (1, 2):
+        side = 2 / 32 * 2**cells
+        coarse = 1.02 * side / 100
+        assert lod.standing_in(octree, (-100, -0.5, 0), coarse).any()
+        opacity = ops.render_rays(octree, o, d, early_stop_eps=0.0, outputs=("opacity",), coarse=coarse)["opacity"]
+        # By the module's head: tau = 13.8 from one axis of three, the wall in one of two layers at its corners; means of
+        # transmittance over points would give less than 0.9 and 0.65.
+        assert opacity[y < 0].min() > (0.98, 0.88)[cells - 1]
+        assert (opacity[y > 0] == 0).all()
+
+
+def test_averages_are_the_same_without_compiled_kernels(monkeypatch):
+    octree = random_octree("mixed", 2, np.random.default_rng(4))
+    if native.native() is None:
+        pytest.skip("no compiled kernels")
+    compiled = lod.node_averages(octree)
+    octree.averages = None
+    monkeypatch.setattr(lod, "native", lambda: None)
+    plain = lod.node_averages(octree)
+    assert np.array_equal(plain.corners, compiled.corners)
+    np.testing.assert_allclose(plain.values, compiled.values, rtol=0, atol=1e-5)  # sums of some 64 numbers of order 1
+
+
+def test_averages_are_kept_until_the_values_change():
+    octree = random_octree("mixed", 1, np.random.default_rng(5))
+    first = lod.node_averages(octree)
+    assert lod.node_averages(octree) is first
+    assert octree.subdivide(np.zeros(octree.n_leaves, bool))[0].averages is None
+    assert octree.prune(np.ones(octree.n_leaves, bool))[0].averages is None
+    assert octree.with_sh_degree(2).averages is None
+    for change in (
+        lambda: setattr(octree, "values", octree.values),
+        lambda: setattr(octree, "density", octree.density + 1),
+        lambda: setattr(octree, "sh", octree.sh + 1),
+        lambda: train_once(octree),
+    ):
+        lod.node_averages(octree)
+        change()
+        assert octree.averages is None
+
+
+def train_once(octree: Octree) -> None:
+    o, d = camera_tiles(octree, np.random.default_rng(0), 1)
+    batch = ops.Batch(o, d, np.zeros((64, 3), np.float32), np.ones(64, np.float32))
+    ops.train_step(octree, ops.TrainState(octree), batch, ops.LossOptions(), ops.Rates(0.1, 0.1, 0.1), 0.01)
+
+
+# ------------------------------------------------------------------ pictures
+@pytest.mark.parametrize("kind", ["mixed", "full", "sparse", "single"])
+@pytest.mark.parametrize("coarse", [0.05, 0.15, 0.6])
+def test_the_walk_draws_the_cut_octree(kind, coarse):
+    """Bit by bit: a node that stands in is a leaf. Some of the origins are inside the octree."""
+    rng = np.random.default_rng(6)
+    octree = random_octree(kind, 1, rng)
+    origins, d = camera_tiles(octree, rng, 8)
+    stood_in = 0
+    for tile, origin in enumerate(origins):
+        rays = origin[None], d[64 * tile : 64 * tile + 64]
+        nodes = lod.standing_in(octree, origin, coarse)
+        stood_in += nodes.sum()
+        image, expected = ops.render_rays(octree, *rays, coarse=coarse), ops.render_rays(lod.cut(octree, nodes), *rays)
+        for name in ops.OUTPUTS:
+            assert np.array_equal(image[name], expected[name]), name
+    assert stood_in > 0 or kind in ("single", "sparse") or coarse < 0.5
+
+
+def test_the_reference_draws_the_same(monkeypatch):
+    rng = np.random.default_rng(7)
+    octree = random_octree("mixed", 2, rng)
+    o, d = camera_tiles(octree, rng, 4)
+    compiled = ops.render_rays(octree, o, d, early_stop_eps=0.0, coarse=0.15)
+    assert not np.array_equal(compiled["rgb"], ops.render_rays(octree, o, d, early_stop_eps=0.0)["rgb"])
+    monkeypatch.setattr(ops, "native", lambda: None)
+    plain = ops.render_rays(octree, o, d, early_stop_eps=0.0, coarse=0.15)
+    for name in ops.OUTPUTS:  # sums over at most some 20 cells of values of order 3, places in small cells off by 1e-5
+        np.testing.assert_allclose(compiled[name], plain[name], rtol=0, atol=2e-4, err_msg=name)
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    if native.native() is None:
+        pytest.skip("no compiled kernels")
+    octree = random_octree("mixed", 1, np.random.default_rng(8))
+    camera, before = camera_at((2.5, 1.0, 0.7), 50), ops.get_threads()
+    images, averages = [], []
+    for n in (1, 2, 3):
+        ops.set_threads(n)
+        octree.averages = None
+        images.append(render_image(octree, camera, lod=4.0)["rgb"])
+        averages.append(octree.averages.values)
+    ops.set_threads(before)
+    for k in (1, 2):
+        assert np.array_equal(images[0], images[k]) and np.array_equal(averages[0], averages[k])
+
+
+def test_without_small_nodes_every_bit_is_that_of_the_leaves(sphere_octree):
+    camera = camera_at((3.0, 0.4, 0.6), 32, focal=1.4)
+    side, centre = sides_and_centres(sphere_octree)
+    smallest = (side / np.linalg.norm(centre - camera.position, axis=1))[1:].min() * camera.intrinsics.fx
+    exact = render_image(sphere_octree, camera, lod=0.0)
+    assert lod.may_stand_in(sphere_octree, camera.position, 0.999 * smallest / camera.intrinsics.fx)
+    below, above = (render_image(sphere_octree, camera, lod=factor * smallest) for factor in (0.999, 1.2))
+    for name in ops.OUTPUTS:
+        assert np.array_equal(below[name], exact[name]), name
+    assert not np.array_equal(above["rgb"], exact["rgb"])
+
+
+def test_a_small_picture_is_nearer_to_the_average_of_a_large_one():
+    """A speckled opaque block, pixels of some 5x5 leaves: a ray through a leaf sees one speckle, a node their mean."""
+    octree = cube(5, scale=100.0, degree=0)
+    octree, _ = octree.prune(octree.leaf_ijk[:, 0] > 24)
+    octree.density, octree.sh = 2.0, np.random.default_rng(1).uniform(-1.5, 1.5, (octree.n_vertices, 3, 1))
+    small, large = (camera_at((9.0, 0.4, 0.6), size, focal=4.0) for size in (8, 128))
+    truth = render_image(octree, large, lod=0.0)["rgb"].reshape(8, 16, 8, 16, 3).mean((1, 3))
+    errors = [np.sqrt(((render_image(octree, small, lod=pixels)["rgb"] - truth) ** 2).mean()) for pixels in (0.0, 1.0)]
+    assert errors[1] < 0.6 * errors[0], errors
+
+
+def test_normals_of_coarse_cells_point_as_those_of_leaves(sphere_octree):
+    camera = camera_at((3.0, 0.4, 0.6), 24, focal=1.4)
+    exact, coarse = (render_image(sphere_octree, camera, early_stop_eps=0.0, lod=pixels) for pixels in (0.0, 2.0))
+    solid = (exact["opacity"] > 0.99) & (coarse["opacity"] > 0.9)
+    cosine = (exact["normal"] * coarse["normal"]).sum(-1) / np.maximum(
+        np.linalg.norm(exact["normal"], axis=-1) * np.linalg.norm(coarse["normal"], axis=-1), 1e-9
+    )
+    assert solid.sum() > 50 and np.median(cosine[solid]) > 0.95
+    near = np.abs(exact["median_depth"] - coarse["median_depth"])[solid]
+    assert np.median(near) < 2 * sphere_octree.size / 2.0**sphere_octree.max_level
+
+
+# ------------------------------------------------------------------ cuts and arguments
+def test_an_octree_cut_off_at_a_level_covers_the_same_leaves():
+    octree = random_octree("mixed", 1, np.random.default_rng(9))
+    coarse = lod.at_level(octree, 3)
+    coarse.validate()
+    assert coarse.max_level == 3 and coarse.n_leaves < octree.n_leaves
+    found = coarse.query(octree.leaf_centers())
+    assert (found >= 0).all()  # nothing lost
+    assert (np.bincount(found, minlength=coarse.n_leaves) > 0).all()  # nothing added
+    same = lod.at_level(octree, 9)
+    assert np.array_equal(same.leaf_ijk, octree.leaf_ijk) and np.array_equal(same.values, octree.values)
+
+
+@pytest.mark.parametrize("bad", [-1.0, math.nan, math.inf])
+def test_bad_levels_of_detail_are_refused(bad, sphere_octree):
+    with pytest.raises(ValueError, match="lod must be"):
+        render_image(sphere_octree, camera_at((3, 0, 0), 8), lod=bad)
+    o, d = camera_tiles(sphere_octree, np.random.default_rng(0), 1)
+    with pytest.raises(ValueError, match="coarse must be"):
+        ops.render_rays(sphere_octree, o, d, coarse=bad)
+
+
+@pytest.mark.parametrize("bad", ["-1", "nan", "inf", "two"])
+def test_the_command_line_refuses_them_too(bad, command, tmp_path):
+    code, _, error = command("render", tmp_path, "--orbit", 1, "--out", tmp_path, "--lod", bad)
+    assert code == 2 and "lod" in error
