@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test sanitize clean
+.PHONY: demo test sanitize clang no-compiler clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -20,6 +20,16 @@ test: $(BIN)/python
 sanitize: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]' cmake ninja nanobind
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tests/kernels/sanitize.py
+
+# The same source built with Clang, no warning allowed, under what tests the kernels; nothing where there is no clang++.
+clang: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]' cmake ninja nanobind
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tests/kernels/clang.py
+
+# The package built and used where there is no C++ compiler.
+no-compiler: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]'
+	$(BIN)/python tests/kernels/no_compiler.py
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

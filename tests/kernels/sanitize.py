@@ -1,9 +1,8 @@
 """Builds the kernels with the address and undefined-behaviour sanitizers and runs the kernels' tests on them.
 
-    python tests/kernels/sanitize.py [BUILD_DIR]      (make sanitize)
+    python tests/kernels/sanitize.py      (make sanitize)
 
-The build directory (default build/sanitize) is kept, so that a second run compiles only what has changed. Exits with 0
-where there is no C++ compiler or no sanitizer runtime: then there is nothing to check.
+Exits with 0 where there is no C++ compiler or no sanitizer runtime: then there is nothing to check.
 """
 
 from __future__ import annotations
@@ -14,7 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from own_build import build_kernels, run_tests
+
 # Every build of every kernel: images, gradients, steps, determinism (threads) and the refusals.
 TESTS = ("test_ops.py", "test_train.py", "test_determinism.py", "test_checks.py")
 
@@ -30,31 +30,18 @@ def runtime(compiler: str) -> str:
 
 def main() -> int:
     compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
-    cmake = shutil.which("cmake")
-    library = runtime(compiler) if compiler and cmake else ""
-    if not library:
+    library = runtime(compiler) if compiler and shutil.which("cmake") else ""
+    if not compiler or not library:
         print("sanitize: no C++ compiler, CMake or sanitizer runtime here; nothing was checked")
         return 0
-    build = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build" / "sanitize").resolve()
-    generator = ["-G", "Ninja"] if shutil.which("ninja") else []
-    source = ROOT / "nerfvol" / "kernels" / "csrc"
-    options = ["-DNERFVOL_SANITIZE=ON", "-DSKBUILD_PROJECT_VERSION=sanitize", f"-DPython_EXECUTABLE={sys.executable}"]
-    subprocess.run([cmake, "-S", source, "-B", build, *generator, *options], check=True, stdout=subprocess.DEVNULL)
-    subprocess.run([cmake, "--build", build, "--parallel"], check=True, stdout=subprocess.DEVNULL)
+    build = build_kernels("sanitize", compiler, ["-DNERFVOL_SANITIZE=ON"])
     environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(build), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep),
         "LD_PRELOAD": library,
         # Python and torch keep memory to their end: leaks are not looked for. A report ends the run.
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0:halt_on_error=1",
         "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
-        "OMP_NUM_THREADS": "1",
-        "NERFVOL_EXPECT_KERNELS": str(build),
     }
-    tests = [str(ROOT / "tests" / "kernels" / name) for name in TESTS]
-    # -s: a sanitizer writes its report to the process's own stderr, which pytest would swallow.
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-s", "-p", "no:cacheprovider", *tests]
-    return subprocess.run(command, cwd=ROOT, env=environment).returncode
+    return run_tests(build, [f"kernels/{name}" for name in TESTS], environment)
 
 
 if __name__ == "__main__":
