@@ -3,6 +3,7 @@
 Views are those of the octree's own orbit. Training steps run at learning rate zero on tiles of such views, so that the
 octree under measurement stays what it is while every byte is touched as in training. Coarser octrees for the cost
 against size are the given one cut off at each level (lod.at_level). Pictures are drawn as ``nerfvol render`` does.
+roofline.py says what the machine allows at most.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfvol import __version__, lod, runs
+from nerfvol import __version__, lod, plots, roofline, runs
 from nerfvol.camera_paths import orbit_cameras
 from nerfvol.cameras import Camera, tile_pixels
 from nerfvol.files import ensure_writable_folder, write_json
@@ -40,11 +41,14 @@ def run_bench(options: BenchOptions) -> int:
     """Measure everything, print tables, write JSON where asked."""
     if options.json is not None:
         ensure_writable_folder(Path(options.json).parent)
+    if options.plot is not None:
+        plots.check_plot(options.plot, options.runs)
     path = runs.octree_path(options.target)
     threads = options.threads or usable_cores()
     ops.set_threads(threads)
     octree, metadata = load_octree(path)
     orbit = find_orbit(options.target, octree, metadata)
+    machine = roofline.measure_machine(threads)
 
     def cameras(size: int) -> list[Camera]:
         return orbit_cameras(VIEWS, orbit, (size, size))
@@ -53,17 +57,23 @@ def run_bench(options: BenchOptions) -> int:
         "nerfvol": __version__,
         "hardware": describe_hardware(),
         "threads": threads,
+        "machine": {**vars(machine), "bandwidth": machine.bandwidth},
+        "view_size": BASE_SIZE,
         "octree": {"path": str(path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
         "file": measure_loading(path, options.repeats),
         "render": measure_rendering(octree, [cameras(size) for size in options.sizes], threads, options.repeats),
-        "size": measure_sizes(octree, cameras(BASE_SIZE), options.repeats),
+        "size": measure_sizes(octree, cameras(BASE_SIZE), options.repeats, machine),
     }
+    record["exponents"] = exponents(record["size"])
     if options.reference:
         record["reference"] = measure_reference(octree, cameras(BASE_SIZE), record)
     print_tables(record)
     if options.json is not None:
         write_json(options.json, record)
         print(f"figures: {options.json}")
+    if options.plot is not None:
+        plots.draw_bench(options.plot, record, options.runs)
+        print(f"picture: {options.plot}")
     return 0
 
 
@@ -111,8 +121,10 @@ def _frame_seconds(octree: Octree, cameras: Sequence[Camera], repeats: int) -> f
     return median_seconds(frame, repeats)
 
 
-def measure_sizes(octree: Octree, cameras: Sequence[Camera], repeats: int) -> list[dict[str, Any]]:
-    """Rendering and training rates of the octree and of coarser versions of it, coarsest first."""
+def measure_sizes(
+    octree: Octree, cameras: Sequence[Camera], repeats: int, machine: roofline.Machine
+) -> list[dict[str, Any]]:
+    """Rendering and training rates of the octree and of coarser versions of it, coarsest first, and what limits them."""
     rows = []
     for level in range(max(5, octree.max_level - 4), octree.max_level + 1):
         tree = octree if level == octree.max_level else lod.at_level(octree, level)
@@ -124,9 +136,17 @@ def measure_sizes(octree: Octree, cameras: Sequence[Camera], repeats: int) -> li
                 "frames_per_second": 1.0 / _frame_seconds(tree, cameras, repeats),
                 "train_rays_per_second": rate,
                 "samples_per_ray": samples,
+                **roofline.roofs(tree, cameras[0], _batch(tree, cameras[0], 0, TRAIN_TILES), machine),
             }
         )
     return rows
+
+
+def exponents(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """The powers of the number of leaves with which the time of a frame and of a training ray grow; None: one size."""
+    leaves = [row["leaves"] for row in rows]
+    keys = {"frame": "frames_per_second", "train_ray": "train_rays_per_second"}
+    return {name: roofline.fitted_exponent(leaves, [1.0 / row[key] for row in rows]) for name, key in keys.items()}
 
 
 def training_rate(octree: Octree, cameras: Sequence[Camera], repeats: int) -> tuple[float, float]:
@@ -230,6 +250,7 @@ def print_tables(record: dict[str, Any]) -> None:
             f"{2 ** row['level']:8d}³ {row['leaves']:12,d} {row['frames_per_second']:16.2f} "
             f"{row['train_rays_per_second']:18,.0f} {row['samples_per_ray']:14.1f}"
         )
+    _print_roofline(record)
     if "reference" in record:
         r = record["reference"]
         print(
@@ -240,4 +261,23 @@ def print_tables(record: dict[str, Any]) -> None:
         print(
             f"one training step of {r['train_step_rays']:,} rays: kernels {r['kernel_train_step_seconds'] * 1e3:.1f} ms, "
             f"plain torch {r['torch_train_step_seconds']:.1f} s ({r['train_step_kernel_over_torch']:,.0f} times slower)"
+        )
+
+
+def _print_roofline(record: dict[str, Any]) -> None:
+    machine, powers = record["machine"], record["exponents"]
+    if powers["frame"] is not None:
+        print(f"time grows as leaves^{powers['frame']:.2f} a frame, leaves^{powers['train_ray']:.2f} a training ray")
+    print(
+        f"\nroofline: memory {machine['read'] / 1e9:.1f} GB/s read, {machine['copy'] / 1e9:.1f} GB/s copied; float32 "
+        f"{machine['operations'] / 1e9:.0f} GFLOP/s ({machine['threads']} threads)"
+    )
+    print("                 ------- frames/s allowed by -------   --- training Mrays/s allowed by ---")
+    print("finest grid        MB/frame   bandwidth  arithmetic    bytes/ray   bandwidth  arithmetic")
+    for row in record["size"]:
+        print(
+            f"{2 ** row['level']:8d}³ {row['frame_bytes'] / 1e6:17.1f} {row['frames_per_second_by_bandwidth']:11.0f} "
+            f"{row['frames_per_second_by_arithmetic']:11.0f} {row['train_ray_bytes']:12.0f} "
+            f"{row['train_rays_per_second_by_bandwidth'] / 1e6:11.1f} "
+            f"{row['train_rays_per_second_by_arithmetic'] / 1e6:11.1f}"
         )

@@ -203,6 +203,8 @@ def _bench_arguments(p: _Parser) -> None:
     p.add_argument("--no-reference", dest="reference", action="store_false",
                    help="leave out the comparison with plain torch and the paper-size MLP")  # fmt: skip
     p.add_argument("--json", metavar="FILE", help="write every figure as JSON")
+    p.add_argument("--plot", metavar="FILE", help="draw the curves (.png, .svg or .pdf; needs nerfvol[plot])")
+    p.add_argument("--runs", metavar="RUN", nargs="+", help="with --plot: also PSNR against seconds of these runs")
 
 
 def _assemble(cls: Any, given: dict[str, Any], base: tuple[dict[str, Any], str] | None = None) -> Any:

@@ -109,6 +109,8 @@ class BenchOptions:
     data: str | None = None
     reference: bool = True
     json: str | None = None
+    plot: str | None = None
+    runs: tuple[str, ...] = ()
     threads: int = 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tiny import make_sphere_octree
 
-from nerfvol import bench
+from nerfvol import bench, roofline
 from nerfvol.camera_paths import default_orbit, orbit_cameras
 from nerfvol.octree_io import save_octree
 
@@ -37,15 +37,23 @@ def test_bench_command(tmp_path, command, monkeypatch):
     monkeypatch.setattr(bench, "REFERENCE_RAYS", 64)
     monkeypatch.setattr(bench, "REFERENCE_TILES", 4)
     monkeypatch.setattr(bench, "TRAIN_TILES", 16)
+    machine = roofline.Machine(read=2e10, copy=3e10, operations=1e11, threads=1)
+    monkeypatch.setattr(roofline, "measure_machine", lambda threads: machine)
     save_octree(tmp_path / "o.safetensors", make_sphere_octree(5), {})
     code, text, _ = command(
         "bench", tmp_path / "o.safetensors", "--sizes", "16,32", "--repeats", 1, "--threads", 1,
-        "--json", tmp_path / "b.json",
+        "--json", tmp_path / "b.json", "--plot", tmp_path / "b.svg",
     )  # fmt: skip
-    assert code == 0 and "frames a second" in text and "training rays/s" in text
+    assert code == 0 and "roofline: memory 20.0 GB/s read, 30.0 GB/s copied" in text
+    assert (tmp_path / "b.svg").read_text().startswith("<?xml")
+    assert "frames a second" in text and "training rays/s" in text
     record = json.loads((tmp_path / "b.json").read_text())
     assert {row["size"] for row in record["render"]} == {16, 32}
     assert all(row["frames_per_second"] > 0 for row in record["render"])
     assert record["size"][-1]["leaves"] == make_sphere_octree(5).n_leaves
     assert record["reference"]["kernel_over_paper_mlp"] > 0 and record["reference"]["train_step_kernel_over_torch"] > 0
+    assert record["machine"]["bandwidth"] == 3e10 and record["exponents"] == {"frame": None, "train_ray": None}
+    size = record["size"][-1]
+    assert size["frames_per_second_by_bandwidth"] * size["frame_bytes"] == pytest.approx(3e10)
+    assert size["train_rays_per_second_by_arithmetic"] * size["train_ray_operations"] == pytest.approx(1e11)
     assert record["file"]["bytes"] == (tmp_path / "o.safetensors").stat().st_size

@@ -25,6 +25,7 @@ LAYERS: dict[int, set[str]] = {
     3: {
         "datasets", "camera_paths", "pictures", "config", "options", "runs", "machine", "memory", "checkpoint", "tiles",
         "train_field", "distill", "finetune", "session", "trainer", "render", "evaluate", "truth",
+        "roofline", "plots",
     },
     # what a person calls
     4: {"cli", "viewer", "export", "bench", "info", "demo"},
