@@ -56,8 +56,19 @@ template <class H> inline void splat(float x, Pair<H>& v) { splat(x, v.lo); spla
 template <class V> inline V splat(float x) { V v; splat(x, v); return v; }
 inline f16 splat16(float x) { return splat<f16>(x); }
 
-template <class V> inline V load(const void* p) { V v; std::memcpy(&v, p, sizeof(V)); return v; }
+// A Pair goes half by half: as a whole GCC copies it through the stack in pieces of 16 bytes, and reading back a vector
+// of 32 from those waits for all of them.
+template <class V> inline void read(const void* p, V& v) { std::memcpy(&v, p, sizeof(V)); }
+template <class H> inline void read(const void* p, Pair<H>& v) {
+    read(p, v.lo);
+    read(static_cast<const char*>(p) + sizeof(H), v.hi);
+}
+template <class V> inline V load(const void* p) { V v; read(p, v); return v; }
 template <class V> inline void store(void* p, const V& v) { std::memcpy(p, &v, sizeof(V)); }
+template <class H> inline void store(void* p, const Pair<H>& v) {
+    store(p, v.lo);
+    store(static_cast<char*>(p) + sizeof(H), v.hi);
+}
 
 // Keeps eight numbers in memory: broadcasting from there is one load, from a register several shuffles.
 inline void keep_in_memory(float (&w)[8]) { __asm__("" : "+m"(w)); }
