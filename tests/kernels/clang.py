@@ -13,7 +13,7 @@ import sys
 
 from own_build import build_kernels, run_tests
 
-TESTS = ("kernels", "test_octree.py", "test_render.py", "test_tiles.py")
+TESTS = ("kernels", "test_lod.py", "test_octree.py", "test_render.py", "test_tiles.py")
 
 
 def main() -> int:
