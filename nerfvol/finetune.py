@@ -53,9 +53,9 @@ class OctreeConfig:
     rate_density: float = 0.3
     rate_dc: float = 0.07
     rate_sh: float = 0.006
-    rate_decay: float = 0.02
+    rate_decay: float = 0.04
     """Learning rates shrink exponentially to this factor ..."""
-    decay_from: float = 0.35
+    decay_from: float = 0.8
     """... from this share of progress on."""
     beta: float = 0.98
     prune_weight: float = 0.005
@@ -73,7 +73,7 @@ class OctreeConfig:
     """... those larger than this many pixels ..."""
     subdivide_error: float = 0.7
     """... that are among the fewest to hold this share of the squared error."""
-    fine_steps: int = 3000
+    fine_steps: int = 2500
     """A stage from level ``fine_from`` on is left out where fewer steps would be left for it."""
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""
