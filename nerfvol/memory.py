@@ -18,7 +18,7 @@ from nerfvol.octree import BLOCKS
 
 BASE_BYTES = 400 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
-lego's 5-minute run has at its peak (1.12 GiB) beside the arrays named below."""
+lego's 5-minute run has at its peak (1.12 to 1.22 GiB) beside the arrays named below."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
@@ -32,8 +32,8 @@ and the new rows of values (64 a vertex), where 1.32 vertices stay for each leaf
 the old values are gone. A split needs less: the octree before it is a fraction of the one after it."""
 TILE_BYTES_PER_PIXEL = 3.25
 """Per training pixel: 8-bit RGB, and a 64th of a tile's image, number, place in a queue (int32 each) and colour (bool)."""
-LEAVES_PER_PIXEL = 1.85
-"""Leaves of an octree split where it pays, for each pixel of one view: 1.18 million for lego at 800x800. Thick media have
+LEAVES_PER_PIXEL = 2.1
+"""Leaves of an octree split where it pays, for each pixel of one view: 1.32 million for lego at 800x800. Thick media have
 several times as many."""
 MOST_LEAVES = 1 << 27
 """Eight corners each are numbered with 31 bits."""
