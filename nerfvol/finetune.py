@@ -17,7 +17,7 @@ from nerfvol.datasets import Dataset, SceneBounds
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.memory import splits_within
-from nerfvol.octree import Octree, Transfer
+from nerfvol.octree import Octree, Transfer, convert_rows
 from nerfvol.tiles import Cursor, TileBank
 
 
@@ -42,6 +42,9 @@ class OctreeConfig:
     prune_steps: int = 20
     """... and this many steps were made: a thin start needs some to become visible at all, however few the pictures."""
     sh_degree: int = 1
+    """Spherical harmonics of the colours: 0 to 3."""
+    final_sh_degree: int = 1
+    """... in the last stage, where it is more: for shiny scenes. It costs memory and steps (docs/performance.md)."""
     rich_share: float = 0.8
     """Share of a batch drawn from tiles that are not plain background."""
     colour: float = 0.06
@@ -93,6 +96,8 @@ class OctreeTrainer:
         for name in ("downscales", "until", "tiles", "prunes"):
             if len(getattr(config, name)) != n:
                 raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
+        if not 0 <= config.final_sh_degree <= 3:
+            raise InputError(f"octree.final_sh_degree must be 0 to 3, got {config.final_sh_degree}")
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
         self.octree = octree if octree is not None else self._thin_start()
         self.state = ops.TrainState(self.octree)
@@ -190,9 +195,17 @@ class OctreeTrainer:
                 break
             transfer = self._change(*self.octree.subdivide(split))
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
+        if self.stage + 1 == len(c.levels) and c.final_sh_degree > self.octree.sh_degree:
+            self._grow_sh(c.final_sh_degree)
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
             self.rich, self.plain = Cursor(), Cursor()
+
+    def _grow_sh(self, degree: int) -> None:
+        """The same field with more bands, which begin at zero."""
+        moments = convert_rows(self.state.moments, self.octree.sh_degree, degree)
+        self.octree = self.octree.with_sh_degree(degree)
+        self.state = ops.TrainState(self.octree, moments)
 
     def _worth_splitting(self, progress: float) -> bool:
         """Whether the next stage, if it is a fine one, will have the steps that it needs at the pace so far."""

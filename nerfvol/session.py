@@ -122,7 +122,7 @@ class Run:
             print(message)
         require_something(self.dataset, config.background)
         lens = self.dataset.cameras[0].intrinsics
-        held, degree = self.held_out.nbytes, config.octree.sh_degree
+        held, degree = self.held_out.nbytes, max(config.octree.sh_degree, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height)
         self.max_leaves = affordable_leaves(self.dataset, degree, least=min(wanted, 1 << 18), held_out_bytes=held)
         estimate = estimate_training(self.dataset, min(wanted, self.max_leaves), degree, held)

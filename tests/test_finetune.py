@@ -1,9 +1,13 @@
 """Coarse to fine: when leaves go and when they are split."""
 
 import numpy as np
+import pytest
 
 from nerfvol.datasets import load_dataset
+from nerfvol.errors import InputError
 from nerfvol.finetune import OctreeConfig, OctreeTrainer
+from nerfvol.octree import DENSITY_SLOT
+from nerfvol.render import render_image
 
 
 def test_nothing_is_pruned_before_it_could_become_visible(tiny_scene):
@@ -67,3 +71,36 @@ def test_the_last_pruning_needs_to_have_seen_enough(tiny_scene):
     tuner, _ = finished_trainer(tiny_scene, 0.03)
     tuner.tiles_seen = 0
     assert tuner.finished() is tuner.octree
+
+
+def test_the_last_stage_has_more_bands(tiny_scene):
+    """They begin at zero, so the picture does not change; then they learn, and a resumed run has them too."""
+    config = OctreeConfig(
+        levels=[4, 4, 4], downscales=[2, 2, 2], until=[0.1, 0.2, 1.0], tiles=[16, 16, 16], prunes=[0, 0, 0],
+        prune_weight=0.0, sh_degree=1, final_sh_degree=2,
+    )  # fmt: skip
+    dataset = load_dataset(tiny_scene, "train")
+    tuner = OctreeTrainer(dataset, (1, 1, 1), config, 0, None)
+    for _ in range(5):
+        tuner.step(0.0)
+    tuner.next_stage()
+    before, moments = tuner.octree, tuner.state.moments
+    tuner.next_stage()
+    assert (before.sh_degree, tuner.octree.sh_degree) == (1, 2)
+    for camera in dataset.cameras[:2]:
+        assert np.array_equal(*(render_image(octree, camera)["rgb"] for octree in (before, tuner.octree)))
+    density = [values[:, DENSITY_SLOT] for values in (moments, tuner.state.moments)]
+    assert density[0].any() and np.array_equal(*density)
+    for _ in range(3):
+        tuner.step(0.5)
+    assert tuner.octree.sh[:, :, 4:].any()
+    again = OctreeTrainer(dataset, (1, 1, 1), config, 0, None)
+    again.load_state_dict(tuner.state_dict())
+    for trainer in (tuner, again):
+        trainer.step(0.6)
+    assert np.array_equal(again.octree.values, tuner.octree.values)
+
+
+def test_a_degree_that_does_not_exist_is_refused(tiny_scene):
+    with pytest.raises(InputError, match="octree.final_sh_degree must be 0 to 3, got 4"):
+        OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), OctreeConfig(final_sh_degree=4), 0, None)
