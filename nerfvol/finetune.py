@@ -98,6 +98,8 @@ class OctreeTrainer:
                 raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
         if not 0 <= config.final_sh_degree <= 3:
             raise InputError(f"octree.final_sh_degree must be 0 to 3, got {config.final_sh_degree}")
+        if not 0 <= config.decay_from < 1:
+            raise InputError(f"octree.decay_from must lie in [0, 1), got {config.decay_from}")
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
         self.octree = octree if octree is not None else self._thin_start()
         self.state = ops.TrainState(self.octree)

@@ -101,6 +101,13 @@ def test_the_last_stage_has_more_bands(tiny_scene):
     assert np.array_equal(again.octree.values, tuner.octree.values)
 
 
-def test_a_degree_that_does_not_exist_is_refused(tiny_scene):
-    with pytest.raises(InputError, match="octree.final_sh_degree must be 0 to 3, got 4"):
-        OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), OctreeConfig(final_sh_degree=4), 0, None)
+@pytest.mark.parametrize(
+    "setting, expected",
+    [
+        ({"final_sh_degree": 4}, "final_sh_degree must be 0 to 3, got 4"),
+        ({"decay_from": 1.0}, r"decay_from must lie in \[0, 1\)"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(tiny_scene, setting, expected):
+    with pytest.raises(InputError, match=f"octree.{expected}"):
+        OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), OctreeConfig(**setting), 0, None)
