@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from nerfvol import pictures, runs
 from nerfvol.camera_paths import cameras_document, default_orbit, describe_orbit, load_cameras, orbit_cameras
-from nerfvol.cameras import TILE, Camera, Intrinsics
+from nerfvol.cameras import Camera, Intrinsics
 from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder, write_json
 from nerfvol.kernels import ops
@@ -43,22 +43,14 @@ def render_image(
     if not 0 <= lod < np.inf:
         raise ValueError(f"lod must be a number of pixels, 0 or more and finite, got {lod}")
     lens = camera.intrinsics
-    view = ops.View(_tiled_directions(lens), camera.c2w, lens.height, lens.width)
+    view = ops.View(_directions(lens), camera.c2w, lens.height, lens.width)
     return ops.render_view(octree, view, background, early_stop_eps, outputs, lod / max(lens.fx, lens.fy))
 
 
 @functools.lru_cache(maxsize=1)
-def _tiled_directions(lens: Intrinsics) -> Float:
-    """Unit directions in camera axes, tile by tile: (rows of tiles, columns of tiles, 3, 64). Kept for a path.
-
-    Tiles that reach beyond the picture's edge are filled by repeating its last row and column.
-    """
-    directions = lens.directions()
-    padding = ((0, -lens.height % TILE), (0, -lens.width % TILE), (0, 0))
-    padded = np.pad(directions, padding, mode="edge") if padding != ((0, 0),) * 3 else directions
-    height, width = padded.shape[:2]
-    tiles = padded.reshape(height // TILE, TILE, width // TILE, TILE, 3).transpose(0, 2, 4, 1, 3)
-    return np.ascontiguousarray(tiles).reshape(height // TILE, width // TILE, 3, TILE * TILE)
+def _directions(lens: Intrinsics) -> Float:
+    """Unit directions in camera axes, as :class:`ops.View` has them. Kept for a path."""
+    return ops.in_squares(lens.directions())
 
 
 def surface_depth(image: Mapping[str, Float]) -> Float:

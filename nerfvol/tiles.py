@@ -9,6 +9,7 @@ import numpy as np
 
 from nerfvol.cameras import tile_pixels
 from nerfvol.datasets import Dataset
+from nerfvol.datasets.images import composite_average
 from nerfvol.kernels.ops import TILE, Batch
 from nerfvol.native import native
 
@@ -25,11 +26,14 @@ class TileBank:
     """All training pixels of one pyramid level as tiles.
 
     A tile is *plain* when all its pixels have the background's colour. Plain tiles teach little but are many: they are
-    drawn less often and weigh more, so that the expected loss stays the mean over all pixels.
+    drawn less often and weigh more, so that the expected loss stays the mean over all pixels. The plain tiles of a picture
+    share one tile of pixels: where much is background, the bank is a fraction of the pictures.
     """
 
     def __init__(self, dataset: Dataset, background: Sequence[float], k: int):
-        self.pixels = dataset.pyramid(background, k, _tiled)
+        sorted_out = dataset.pyramid(background, k, lambda image: _sort_out(_tiled(image), background))
+        self.pixels = [pixels for pixels, _ in sorted_out]
+        self.row = np.concatenate([row for _, row in sorted_out])
         cameras = [c.scaled(k) for c in dataset.cameras]
         self.origins = np.stack([c.c2w[:3, 3] for c in cameras]).astype(np.float32)
         self.rotations = np.stack([c.c2w[:3, :3] for c in cameras]).astype(np.float32)
@@ -37,7 +41,6 @@ class TileBank:
         tables: dict = {}  # camera-space directions in tile order, per distinct intrinsics
         self._directions: list[np.ndarray] = []
         insides, image_of, tile_of = [], [], []
-        plain_colour = np.round(np.asarray(background) * 255).astype(np.uint8)
         for i, camera in enumerate(cameras):
             intrinsics = camera.intrinsics
             flat = tile_pixels(intrinsics.width, intrinsics.height)
@@ -47,8 +50,7 @@ class TileBank:
             insides.append(flat >= 0 if (flat < 0).any() else None)
             image_of.append(np.full(len(flat), i, np.int32))
             tile_of.append(np.arange(len(flat), dtype=np.int32))
-        flat_colour = np.tile(plain_colour, TILE)
-        self.plain = np.concatenate([(p.reshape(len(p), -1) == flat_colour).all(1) for p in self.pixels])
+        self.plain = self.row == 0
         self.image = np.concatenate(image_of)
         self.tile = np.concatenate(tile_of)
         self._inside = insides
@@ -84,16 +86,16 @@ class TileBank:
         """Rays and colours of the given tiles; every ray weighs its tile's weight, padding weighs 0."""
         order = np.argsort(tiles, kind="stable")  # neighbours in one image share the cache
         tiles, tile_weights = tiles[order], tile_weights[order]
-        image, tile = self.image[tiles], self.tile[tiles]
+        image, tile, row = self.image[tiles], self.tile[tiles], self.row[tiles]
         directions = np.empty((len(tiles), TILE, 3), np.float32)
         target = np.empty((len(tiles), TILE, 3), np.float32)
         weight = np.repeat(tile_weights[:, None], TILE, 1)
         if (compiled := native()) is not None:
-            compiled.gather_tiles(self._directions, self.pixels, self.rotations, image, tile, directions, target)
+            compiled.gather_tiles(self._directions, self.pixels, self.rotations, image, tile, row, directions, target)
         else:
-            for i, (m, t) in enumerate(zip(image, tile, strict=True)):
+            for i, (m, t, r) in enumerate(zip(image, tile, row, strict=True)):
                 np.matmul(self._directions[m][t], self.rotations[m].T, out=directions[i])
-                target[i] = self.pixels[m][t]
+                target[i] = self.pixels[m][r]
             target *= np.float32(1 / 255)
         if self._padded:
             for i, (m, t) in enumerate(zip(image, tile, strict=True)):
@@ -108,6 +110,20 @@ def _tiled(image: np.ndarray) -> np.ndarray:
     padded = np.pad(image, ((0, -h % 8), (0, -w % 8), (0, 0)), mode="edge") if h % 8 or w % 8 else image
     rows, cols = padded.shape[0] // 8, padded.shape[1] // 8
     return padded.reshape(rows, 8, cols, 8, 3).transpose(0, 2, 1, 3, 4).reshape(-1, TILE, 3)
+
+
+def _sort_out(tiles: np.ndarray, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (1 + rich tiles, 64, 3), a plain tile first, and which of them each of ``tiles`` (n, 64, 3) has: (n,)."""
+    plain_tile = np.tile(np.round(np.asarray(background) * 255).astype(np.uint8), (1, TILE, 1))
+    rich = (tiles != plain_tile).any((1, 2))
+    return np.concatenate([plain_tile, tiles[rich]]), np.where(rich, np.cumsum(rich), 0).astype(np.int32)
+
+
+def rich_share(dataset: Dataset, background: Sequence[float], views: int = 4) -> float:
+    """Share of tiles that are not plain, in a few of the dataset's views: how large a TileBank will be."""
+    chosen = np.linspace(0, len(dataset) - 1, min(views, len(dataset))).round().astype(int)
+    few = [_sort_out(_tiled(composite_average(dataset.images[i], background, 1)), background)[1] for i in chosen]
+    return float(np.mean(np.concatenate(few) > 0))
 
 
 def _next(tiles: np.ndarray, cursor: Cursor, count: int, seed: list[int]) -> np.ndarray:

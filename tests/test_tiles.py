@@ -80,6 +80,9 @@ def test_plain_tiles_are_the_background_and_nothing_else(odd):
     targets = whole_batch(white).target.reshape(white.n_tiles, -1)
     assert np.array_equal((targets == 1).all(1), white.plain)
     assert np.array_equal(np.sort(np.concatenate([white.rich_tiles, white.plain_tiles])), np.arange(white.n_tiles))
+    # of the plain ones a picture keeps one, and how many there are is known before
+    assert sum(map(len, white.pixels)) == len(white.rich_tiles) + len(odd)
+    assert tiles.rich_share(odd, WHITE, views=100) == len(white.rich_tiles) / white.n_tiles
 
 
 def drawn(bank: TileBank, n: int, count: int, share: float = 0.6, seed: int = 5):
@@ -162,23 +165,25 @@ def gathered(**change):
         directions=[np.zeros((n, TILE, 3), np.float32) for n in (2, 3)],
         pixels=[np.zeros((n, TILE, 3), np.uint8) for n in (2, 3)],
         rotations=np.zeros((2, 3, 3), np.float32), image=np.array([0, 1, 1]), tile=np.array([1, 0, 2]),
+        row=np.array([1, 2, 0]),
         out=np.zeros((3, TILE, 3), np.float32), target=np.zeros((3, TILE, 3), np.float32),
     )  # fmt: skip
     native().gather_tiles(**arrays | change)
 
 
 @pytest.mark.skipif(native() is None, reason="no compiled kernels")
-@pytest.mark.parametrize("image, tile", [(0, 2), (1, 3), (1, 10**6), (1, -1), (2, 0), (-1, 0)])
-def test_tiles_outside_their_picture_are_refused(image, tile):
+@pytest.mark.parametrize("image, tile, row", [(0, 2, 0), (1, 3, 0), (1, 10**6, 0), (1, -1, 0), (2, 0, 0),
+                                              (-1, 0, 0), (0, 0, 2), (1, 0, 3), (1, 0, -1)])  # fmt: skip
+def test_tiles_outside_their_picture_are_refused(image, tile, row):
     """The compiled code reads where it is told: it looks first."""
     gathered()
     with pytest.raises(ValueError, match="a tile lies outside its picture"):
-        gathered(image=np.array([0, 1, image]), tile=np.array([1, 0, tile]))
+        gathered(image=np.array([0, 1, image]), tile=np.array([1, 0, tile]), row=np.array([1, 2, row]))
 
 
 @pytest.mark.skipif(native() is None, reason="no compiled kernels")
 @pytest.mark.parametrize("change", [
-    {"tile": np.array([1, 0])}, {"out": np.zeros((2, TILE, 3), np.float32)},
+    {"tile": np.array([1, 0])}, {"row": np.array([1, 2])}, {"out": np.zeros((2, TILE, 3), np.float32)},
     {"target": np.zeros((2, TILE, 3), np.float32)}, {"rotations": np.zeros((1, 3, 3), np.float32)},
     {"directions": [np.zeros((9, TILE, 3), np.float32)]},
     {"pixels": [np.zeros((n, TILE, 3), np.uint8) for n in (2, 2)]},

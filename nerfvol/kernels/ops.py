@@ -17,7 +17,19 @@ from typing import Any
 import numpy as np
 
 from nerfvol import lod
-from nerfvol.kernels.state import DEFAULT_EARLY_STOP, WHITE, Batch, LossOptions, Rates, StepReport, TrainState, View
+from nerfvol.kernels.state import (
+    DEFAULT_EARLY_STOP,
+    SQUARE,
+    WHITE,
+    Batch,
+    LossOptions,
+    Rates,
+    StepReport,
+    TrainState,
+    View,
+    from_squares,
+    in_squares,
+)
 from nerfvol.native import native
 from nerfvol.octree import BLOCKS, Octree
 
@@ -181,9 +193,9 @@ def render_view(
 ) -> dict[str, np.ndarray]:
     """Renders a camera's picture; results as in :func:`render_rays`, (height, width[, 3])."""
     directions, camera_to_world, height, width = view.directions, view.camera_to_world, view.height, view.width
-    tiles = (-(-height // 8), -(-width // 8), 3, TILE)
-    if directions.shape != tiles or directions.dtype != np.float32 or not directions.flags.c_contiguous:
-        raise ValueError(f"directions must be float32 {tiles}, got {directions.dtype} {directions.shape}")
+    squares = (-(-height // SQUARE), -(-width // SQUARE), 4, 3, TILE)
+    if directions.shape != squares or directions.dtype != np.float32 or not directions.flags.c_contiguous:
+        raise ValueError(f"directions must be float32 {squares}, got {directions.dtype} {directions.shape}")
     rotation, origin = np.asarray(camera_to_world)[:3, :3], np.asarray(camera_to_world, np.float32)[:3, 3]
     if not np.isfinite(camera_to_world).all():
         raise ValueError("camera_to_world must be finite")
@@ -191,10 +203,10 @@ def render_view(
     _check_outputs(outputs)
     coarse = check_coarse(octree, origin, coarse)
     if (compiled := native()) is None:
-        flat = directions.swapaxes(2, 3).reshape(-1, 3) @ rotation.T.astype(np.float32)
-        origins = np.broadcast_to(origin, (len(flat) // TILE, 3)).copy()
+        flat = from_squares(directions, height, width).reshape(-1, 3) @ rotation.T.astype(np.float32)
+        origins = np.broadcast_to(origin, (-(-len(flat) // TILE), 3)).copy()
         rays = _on_torch().render_rays(octree, origins, flat, bg, eps, outputs, coarse)
-        return {name: _from_tiles(rows, tiles[0], tiles[1])[:height, :width] for name, rows in rays.items()}
+        return {name: rows.reshape(height, width, *rows.shape[1:]) for name, rows in rays.items()}
     out = _empty_outputs(outputs, (height, width))
     tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32), coarse)
     frame = (rotation.ravel().tolist(), origin.tolist(), height, width)
@@ -217,12 +229,6 @@ def _finished(out: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if "opacity" in out:
         np.subtract(1, out["opacity"], out=out["opacity"])
     return out
-
-
-def _from_tiles(rows: np.ndarray, down: int, across: int) -> np.ndarray:
-    """(down * across * 64, ...) in tiles as a picture (8 down, 8 across, ...)."""
-    tiles = rows.reshape(down, across, 8, 8, *rows.shape[1:])
-    return tiles.swapaxes(1, 2).reshape(8 * down, 8 * across, *rows.shape[1:])
 
 
 # ------------------------------------------------------------------ training

@@ -12,18 +12,42 @@ from nerfvol.octree import Octree
 from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
 
 
+SQUARE = 16
+"""Pixels along a square of a view: what the kernels render as one packet."""
+
+
 @dataclass(frozen=True)
 class View:
     """A camera's picture of height x width pixels.
 
-    directions: (tile rows, tile columns, 3, 64) float32 unit directions in camera axes, a row of 64 for each 8x8 tile;
-    tiles at the right and lower edge may reach beyond the picture. camera_to_world: (4, 4), or (3, 4).
+    directions: (square rows, square columns, 4, 3, 64) float32 unit directions in camera axes, see :func:`in_squares`;
+    camera_to_world: (4, 4), or (3, 4).
     """
 
     directions: np.ndarray
     camera_to_world: np.ndarray
     height: int
     width: int
+
+
+def in_squares(picture: np.ndarray) -> np.ndarray:
+    """A picture (H, W, k) by squares of 16x16 pixels: (square rows, square columns, 4, k, 64), contiguous.
+
+    A square is four strips of 4 rows; in a strip 2x2 pixels that touch stand beside each other (csrc/packet.h). Squares that
+    reach beyond the picture are filled by repeating its last row and column.
+    """
+    padding = ((0, -picture.shape[0] % SQUARE), (0, -picture.shape[1] % SQUARE), (0, 0))
+    padded = np.pad(picture, padding, mode="edge") if padding != ((0, 0),) * 3 else picture
+    rows, columns = (n // SQUARE for n in padded.shape[:2])
+    parts = padded.reshape(rows, 4, 2, 2, columns, 8, 2, -1).transpose(0, 4, 1, 7, 2, 5, 3, 6)
+    return np.ascontiguousarray(parts).reshape(rows, columns, 4, -1, 64)
+
+
+def from_squares(squares: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The picture (height, width, k) in ``squares``: the inverse of :func:`in_squares`."""
+    rows, columns = squares.shape[:2]
+    parts = squares.reshape(rows, columns, 4, -1, 2, 8, 2, 2).transpose(0, 2, 4, 6, 1, 5, 7, 3)
+    return parts.reshape(SQUARE * rows, SQUARE * columns, -1)[:height, :width]
 
 
 @dataclass(frozen=True)

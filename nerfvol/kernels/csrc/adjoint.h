@@ -96,28 +96,29 @@ private:
 };
 
 template <int B>
-void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, float eps, PacketState& state, Workspace& work) {
+void forward_packet(const Tree& tree, Packet<1>& p, const BasisRows<B>& basis, float eps, PacketState<1>& state, Workspace& work) {
     Extinction x;
+    alignas(64) float raw[kTile], length[kTile];
     work.size = 0;
     work.visits.clear();
     work.first_hit.clear();
-    start(state);
-    march<B>(tree, p, [&](const Leaf& leaf, uint64_t hits, const Segments& s, const LeafField<B>& field) {
-        const int m = __builtin_popcountll(hits);
+    march<B>(tree, p, [&](const Leaf& leaf, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
+        const Segments& s = segments[0];
+        const int m = __builtin_popcountll(hits[0]);
         const size_t base = work.size;
         Hit* h = work.append(size_t(m));
         int i = 0;
-        for (uint64_t rest = hits; rest; rest &= rest - 1, ++i) {
+        for (uint64_t rest = hits[0]; rest; rest &= rest - 1, ++i) {
             const int l = __builtin_ctzll(rest);
             h[i].lane = l;
             h[i].fx = s.fx[l]; h[i].fy = s.fy[l]; h[i].fz = s.fz[l];
             h[i].length = s.length[l] * tree.size;
             h[i].middle = s.middle[l];
             h[i].value = field.at(s.fx[l], s.fy[l], s.fz[l], basis.row[l]);
-            x.raw[i] = h[i].value[3];
-            x.length[i] = h[i].length;
+            raw[i] = h[i].value[3];
+            length[i] = h[i].length;
         }
-        x.evaluate(m, tree.density_scale, true);
+        x.evaluate(raw, length, m, tree.density_scale, true);
         Visit visit = {leaf.index, m, 0, 0, 1e30f, leaf.side};
         for (i = 0; i < m; ++i) {
             const int l = h[i].lane;
@@ -130,8 +131,9 @@ void forward_packet(const Tree& tree, Packet& p, const BasisRows<B>& basis, floa
             state.colour[l] += w * c;
             visit.max_weight = std::max(visit.max_weight, w);
             visit.near = std::min(visit.near, h[i].middle);
-            if (h[i].trans_after < eps) p.alive &= ~(1ull << l);
+            if (h[i].trans_after < eps) p.strips[0].alive &= ~(1ull << l);
         }
+        p.find_alive();
         work.visits.push_back(visit);
         work.first_hit.push_back(int32_t(base));
     });
@@ -146,7 +148,7 @@ struct Adjoint {
     float weight_behind[kTile], moment_behind[kTile];
 };
 
-inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState& s,
+inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState<1>& s,
                                   int64_t first, int n, Adjoint& a) {
     for (int l = 0; l < n; ++l) {
         const int64_t i = first + l;
@@ -162,7 +164,7 @@ inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const R
     }
 }
 
-inline void adjoint_of_loss(const Loss& loss, const PacketState& s, int64_t first, int n, Adjoint& a, StepReport& report) {
+inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t first, int n, Adjoint& a, StepReport& report) {
     for (int l = 0; l < n; ++l) {
         const float* target = loss.target + 3 * (first + l);
         const float weight = loss.weight[first + l];

@@ -5,12 +5,13 @@
 
 namespace nerfvol {
 
-void gather_tiles(const TileSources& from, const int64_t* image, const int64_t* tile, int64_t n, float* directions, float* target) {
+void gather_tiles(const TileSources& from, const int64_t* image, const int64_t* tile, const int64_t* row, int64_t n,
+                  float* directions, float* target) {
     constexpr int64_t kChunk = 16, kRow = 3 * kTile;
     parallel_for(int((n + kChunk - 1) / kChunk), [&](int chunk, int) {
         for (int64_t i = chunk * kChunk; i < n && i < (chunk + 1) * kChunk; ++i) {
             const float* camera = from.directions[std::size_t(image[i])] + kRow * tile[i];
-            const uint8_t* colours = from.pixels[std::size_t(image[i])] + kRow * tile[i];
+            const uint8_t* colours = from.pixels[std::size_t(image[i])] + kRow * row[i];
             const float* r = from.rotations + 9 * image[i];
             float *d = directions + kRow * i, *c = target + kRow * i;
             for (int l = 0; l < kTile; ++l)

@@ -92,14 +92,15 @@ void py_render(const TreeArrays& t, Rows origins, Rows directions, std::vector<f
     kernels().render(t.tree, rays, options, out);
 }
 
-// Directions of a camera's rays (tile rows, tile columns, 64, 3); outputs are pictures (height, width[, 3]).
-void py_render_view(const TreeArrays& t, In<float, nb::shape<-1, -1, 3, 64>> directions, std::vector<float> rotation,
+// Directions of a camera's rays (square rows, square columns, 4, 3, 64); outputs are pictures (height, width[, 3]).
+void py_render_view(const TreeArrays& t, In<float, nb::shape<-1, -1, 4, 3, 64>> directions, std::vector<float> rotation,
                     std::vector<float> origin, int64_t height, int64_t width, std::vector<float> background, float eps,
                     Maybe<Out<float, nb::ndim<3>>> rgb, Maybe<FloatRows> trans, Maybe<FloatRows> depth, Maybe<FloatRows> median,
                     Maybe<Out<float, nb::ndim<3>>> normal) {
     View view{directions.data(), int64_t(directions.shape(0)), int64_t(directions.shape(1)), height, width, {}, {}};
-    if (view.tile_rows * 8 < height || view.tile_columns * 8 < width || height <= view.tile_rows * 8 - 8 || width <= view.tile_columns * 8 - 8)
-        throw std::invalid_argument("the directions do not cover the picture in 8x8 tiles");
+    const auto covers = [](int64_t squares, int64_t pixels) { return squares * kSquare >= pixels && (squares - 1) * kSquare < pixels; };
+    if (!covers(view.square_rows, height) || !covers(view.square_columns, width))
+        throw std::invalid_argument("the directions do not cover the picture in squares of 16x16 pixels");
     for (int k = 0; k < 9; ++k) view.rotation[k] = rotation.at(size_t(k));
     for (int k = 0; k < 3; ++k) view.origin[k] = origin.at(size_t(k));
     const auto check = [&](const auto& a) {
@@ -185,23 +186,24 @@ void py_restrict_cells(In<uint8_t, nb::ndim<1>> mask, In<int32_t, nb::ndim<1>> f
 
 void py_gather_tiles(const std::vector<In<float, nb::shape<-1, 64, 3>>>& directions,
                      const std::vector<In<uint8_t, nb::shape<-1, 64, 3>>>& pixels, In<float, nb::shape<-1, 3, 3>> rotations,
-                     In<int64_t, nb::ndim<1>> image, In<int64_t, nb::ndim<1>> tile, Out<float, nb::shape<-1, 64, 3>> out,
-                     Out<float, nb::shape<-1, 64, 3>> target) {
+                     In<int64_t, nb::ndim<1>> image, In<int64_t, nb::ndim<1>> tile, In<int64_t, nb::ndim<1>> row,
+                     Out<float, nb::shape<-1, 64, 3>> out, Out<float, nb::shape<-1, 64, 3>> target) {
     TileSources from{{}, {}, rotations.data()};
     for (const auto& a : directions) from.directions.push_back(a.data());
     for (const auto& a : pixels) from.pixels.push_back(a.data());
     const int64_t n = int64_t(image.shape(0)), pictures = int64_t(pixels.size());
-    if (int64_t(tile.shape(0)) != n || int64_t(out.shape(0)) != n || int64_t(target.shape(0)) != n)
-        throw std::invalid_argument("image, tile and both outputs must have one row for each tile");
+    if (int64_t(tile.shape(0)) != n || int64_t(row.shape(0)) != n || int64_t(out.shape(0)) != n || int64_t(target.shape(0)) != n)
+        throw std::invalid_argument("image, tile, row and both outputs must have one row for each tile");
     if (int64_t(directions.size()) != pictures || int64_t(rotations.shape(0)) != pictures)
         throw std::invalid_argument("every picture needs directions, pixels and a rotation");
     for (int64_t i = 0; i < n; ++i) {
-        const int64_t m = image.data()[i], t = tile.data()[i];
-        if (m < 0 || m >= pictures || t < 0 || t >= int64_t(pixels[size_t(m)].shape(0)) || t >= int64_t(directions[size_t(m)].shape(0)))
+        const int64_t m = image.data()[i], t = tile.data()[i], r = row.data()[i];
+        if (m < 0 || m >= pictures || t < 0 || t >= int64_t(directions[size_t(m)].shape(0)) || r < 0 ||
+            r >= int64_t(pixels[size_t(m)].shape(0)))
             throw std::invalid_argument("a tile lies outside its picture");
     }
     nb::gil_scoped_release release;
-    gather_tiles(from, image.data(), tile.data(), n, out.data(), target.data());
+    gather_tiles(from, image.data(), tile.data(), row.data(), n, out.data(), target.data());
 }
 
 }  // namespace
@@ -230,7 +232,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);
     m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
     m.def("restrict_cells", &py_restrict_cells, "mask"_a, "first"_a, "corners"_a, "rows"_a, "weight"_a, "density"_a, "sums"_a);
-    m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "out"_a, "target"_a);
+    m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "row"_a, "out"_a, "target"_a);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
     m.def("isa", [] { return std::string(isa_name()); });

@@ -28,20 +28,21 @@ struct Visit {                     // a leaf and its hits, consecutive in the pa
     float side;
 };
 
-struct PacketState {
-    alignas(64) float trans[kTile];
-    f4 colour[kTile];              // r, g, b, expected distance
+template <int S> struct PacketState {
+    alignas(64) float trans[S * kTile];
+    f4 colour[S * kTile];          // r, g, b, expected distance
+
+    PacketState() {
+        for (int l = 0; l < S * kTile; ++l) { trans[l] = 1.0f; colour[l] = f4{}; }
+    }
 };
 
-inline void start(PacketState& s) {
-    for (int l = 0; l < kTile; ++l) { s.trans[l] = 1.0f; s.colour[l] = f4{}; }
-}
-
-// Optical depth, its slope in the raw density, exp(-tau) and alpha of up to 64 hits.
+// Slope of the optical depth in the raw density, exp(-tau) and alpha of up to 64 hits.
 struct Extinction {
-    alignas(64) float raw[kTile], length[kTile], slope[kTile], through[kTile], alpha[kTile];
+    alignas(64) float slope[kTile], through[kTile], alpha[kTile];
 
-    void evaluate(int n, float density_scale, bool with_slope) {
+    // Of n hits; raw and length (scene units) are read up to the next multiple of 16.
+    void evaluate(const float* raw, const float* length, int n, float density_scale, bool with_slope) {
         for (int i = 0; i < n; i += 16) {
             const f16 r = load<f16>(raw + i), scaled = load<f16>(length + i) * density_scale;
             const f16 tau = scaled * explin(r), e = vexp(-tau);
@@ -52,11 +53,12 @@ struct Extinction {
     }
 };
 
-// The segments of one ray packet, delivered leaf by leaf. Leaves wait in a queue while their memory arrives: the walk asks
-// for a leaf's corners, kRows leaves later the corners are read and their rows asked for, kAhead leaves later it is used.
-template <int B, class Sink> void march(const Tree& tree, Packet& p, Sink&& sink) {
+// The segments of one packet, delivered leaf by leaf: sink(leaf, hits, segments, field), the hits as bits and the segments by
+// strip. Leaves wait in a queue while their memory arrives: the walk asks for a leaf's corners, kRows leaves later the corners
+// are read and their rows asked for, kAhead leaves later it is used.
+template <int B, int S, class Sink> void march(const Tree& tree, const Packet<S>& p, Sink&& sink) {
     constexpr uint32_t kAhead = 16, kRows = 8;
-    Walk walk(tree, p);
+    Walk walk(tree, p.pyramid);
     Leaf queue[kAhead];
     uint32_t found = 0, asked = 0, used = 0;
     const auto ask = [&] {
@@ -64,7 +66,7 @@ template <int B, class Sink> void march(const Tree& tree, Packet& p, Sink&& sink
         for (int o = 0; o < 8; ++o)
             for (int k = 0; k < B; ++k) __builtin_prefetch(c.values + 16 * (B * int64_t(c.corners[o]) + k));
     };
-    Segments segments;
+    Segments segments[S];
     for (;;) {
         while (found - used < kAhead && walk.next(queue[found % kAhead])) {
             ++found;
@@ -74,10 +76,15 @@ template <int B, class Sink> void march(const Tree& tree, Packet& p, Sink&& sink
         if (found - used < kAhead)
             while (asked != found) ask();
         Leaf& leaf = queue[used++ % kAhead];
-        leaf.rays &= p.alive;
-        if (!leaf.rays) continue;
-        const uint64_t hits = intersect(p, leaf, segments);
-        if (!hits) continue;
+        leaf.patches &= p.pyramid.alive;
+        if (!leaf.patches) continue;
+        uint64_t hits[S], some = 0;
+        for (int s = 0; s < S; ++s) {
+            const uint64_t lanes = Packet<S>::lanes_of(leaf.patches, s) & p.strips[s].alive;
+            hits[s] = lanes ? intersect(p.strips[s], p.pyramid.o, leaf, lanes, segments[s]) : 0;
+            some |= hits[s];
+        }
+        if (!some) continue;
         const Cell c = cell(tree, leaf.index);
         sink(leaf, hits, segments, LeafField<B>(c.values, c.corners));
     }

@@ -36,11 +36,11 @@ constexpr int kDensitySlot = 12;
 template <int B> struct BasisRows {
     alignas(64) float row[kTile][16 * B];
 
-    void fill(const Packet& p, int degree) {
+    void fill(const Lanes& rays, int degree) {
         for (int l = 0; l < kTile; ++l) {
-            if (!(p.alive >> l & 1)) continue;
+            if (!(rays.alive >> l & 1)) continue;
             float b[16] = {};
-            sh_basis(degree, p.dx[l], p.dy[l], p.dz[l], b);
+            sh_basis(degree, rays.dx[l], rays.dy[l], rays.dz[l], b);
             for (int k = 0; k < B; ++k) {
                 const f4 four = load<f4>(b + 4 * k);
                 f4 last{};

@@ -189,6 +189,17 @@ inline f4 quad_sums(const f16& v) {
 #endif
 }
 
+// The least of sixteen numbers, and of each group of four.
+inline float least(const f16& v) {
+    const f4 m = vmin(vmin(quarter<0>(v), quarter<1>(v)), vmin(quarter<2>(v), quarter<3>(v)));
+    const f4 n = vmin(m, __builtin_shufflevector(m, m, 2, 3, 0, 1));
+    return n[0] < n[1] ? n[0] : n[1];
+}
+inline f4 quad_least(const f16& v) {
+    const auto pairs = [](f4 a, f4 b) { return vmin(__builtin_shufflevector(a, b, 0, 2, 4, 6), __builtin_shufflevector(a, b, 1, 3, 5, 7)); };
+    return pairs(pairs(quarter<0>(v), quarter<1>(v)), pairs(quarter<2>(v), quarter<3>(v)));
+}
+
 template <class V> struct Integers;
 template <> struct Integers<f4> { typedef i4v type; };
 template <> struct Integers<f8> { typedef i8v type; };

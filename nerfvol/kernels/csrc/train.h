@@ -154,17 +154,18 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         PacketRecord& rec = *records[size_t(i)];
         const int64_t first = packets[size_t(i)].first;
         const int count = packets[size_t(i)].second;
-        Packet p;
+        Packet<1> p;
         load_packet(tree, rays, first, first + count, p);
         if (loss) {
-            const uint64_t all = p.alive;
+            uint64_t& alive = p.strips[0].alive;
+            const uint64_t all = alive;
             for (int l = 0; l < count; ++l)
-                if (!(loss->weight[first + l] > 0)) p.alive &= ~(1ull << l);
-            if (p.alive != all) bound_packet(p);  // without the padding the pyramid is tighter
+                if (!(loss->weight[first + l] > 0)) alive &= ~(1ull << l);
+            if (alive != all) bound_packet(p);  // without the padding the pyramid is tighter
         }
         BasisRows<B> basis;
-        basis.fill(p, tree.sh_degree);
-        PacketState state;
+        basis.fill(p.strips[0], tree.sh_degree);
+        PacketState<1> state;
         static thread_local Workspace workspace;
         Workspace& work = workspace;
         forward_packet<B>(tree, p, basis, options.early_stop_eps, state, work);

@@ -5,6 +5,7 @@
 namespace nerfvol {
 
 constexpr int kTile = 64;         // rays in a packet: an 8x8 tile of one image
+constexpr int kSquare = 16;       // pixels along a square of a view
 constexpr int kMaxLevel = 16;
 constexpr int kBuckets = 128;     // ranges of vertices; each is updated by one thread in a fixed order
 
@@ -30,10 +31,11 @@ struct Rays {
     bool origin_per_tile;                        // origins has one row per 64 rays
 };
 
-// A camera's rays: directions in camera axes, tile by tile, rows of tiles from the top; tiles may reach beyond the edges.
+// A camera's rays: directions in camera axes, by squares of 16x16 pixels, rows of squares from the top; squares may reach
+// beyond the edges. packet.h says how a square's pixels stand in its four strips.
 struct View {
-    const float* directions;                     // (tile rows, tile columns, 3, 64) unit length
-    int64_t tile_rows, tile_columns, height, width;
+    const float* directions;                     // (square rows, square columns, 4, 3, 64) unit length
+    int64_t square_rows, square_columns, height, width;
     float rotation[9], origin[3];                // camera to world, row by row; scene units
 };
 

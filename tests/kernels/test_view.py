@@ -1,0 +1,74 @@
+"""Pictures go by squares of 16x16 pixels, rays by tiles of 64: a pixel does not depend on who came along."""
+
+import numpy as np
+import pytest
+
+from nerfvol.cameras import Intrinsics
+from nerfvol.kernels import ops
+from tests.kernels.trees import DYADIC, ODD, random_octree
+
+
+def view_of(octree, rng, width, height, focal, away):
+    """A view along an axis of the octree from ``away`` times its size, and the same rays one by one.
+
+    Axes are only exchanged, which is exact: both have the same directions to the last bit.
+    """
+    axes = rng.permutation(3)
+    rotation = np.zeros((3, 3))
+    rotation[axes, range(3)] = rng.choice([-1.0, 1.0], 3)
+    center = octree.origin + octree.size * rng.uniform(0.3, 0.7, 3)
+    c2w = np.column_stack([rotation, center + away * octree.size * rotation[:, 2]])  # a camera looks along its -z
+    lens = Intrinsics(width, height, focal, focal, 0.47 * width, 0.52 * height)
+    directions = lens.directions()
+    turned = directions.reshape(-1, 3) @ rotation.T.astype(np.float32)
+    view = ops.View(ops.in_squares(directions), c2w, height, width)
+    return view, np.broadcast_to(c2w[:, 3].astype(np.float32), turned.shape).copy(), turned
+
+
+def test_squares_hold_each_pixel_where_the_kernels_look_for_it():
+    """Strips of four rows; in a strip patches of 2x2 pixels, row by row; in a patch two above two."""
+    rows, columns = np.meshgrid(np.arange(37), np.arange(21), indexing="ij")
+    squares = ops.in_squares(np.stack([rows, columns], -1))
+    assert squares.shape == (3, 2, 4, 2, 64)
+    for at, place in [((0, 0, 0, 1), (0, 1)), ((0, 0, 0, 2), (1, 0)), ((0, 0, 0, 4), (0, 2)), ((0, 0, 0, 32), (2, 0)),
+                      ((1, 0, 3, 63), (31, 15)), ((2, 1, 1, 0), (36, 16))]:  # fmt: skip
+        assert tuple(squares[(*at[:3], slice(None), at[3])]) == place
+    assert np.array_equal(ops.from_squares(squares, 37, 21), np.stack([rows, columns], -1))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("kind", ["mixed", "full", "single", "sparse"])
+def test_views_agree_with_rays(isa, kind, degree):
+    """Far and near, from inside, through wide lenses, with patches narrower and wider than leaves; every output."""
+    rng = np.random.default_rng(degree)
+    for frame in (DYADIC, ODD):
+        octree = random_octree(kind, degree, rng, frame)
+        for away, focal in [(2.0, 300.0), (2.0, 60.0), (0.9, 30.0), (0.2, 12.0), (30.0, 300.0)]:
+            view, o, d = view_of(octree, rng, 45, 35, focal, away)
+            for eps in (0.0, 0.3):
+                picture = ops.render_view(octree, view, (0.1, 0.5, 0.9), eps)
+                rays = ops.render_rays(octree, o, d, (0.1, 0.5, 0.9), eps)
+                for name, value in picture.items():
+                    # The same operations, contracted to fused ones as each function's compilation has it: some 60 of
+                    # them on numbers up to 60 (distances) and up to 3 (all else).
+                    unit = 60 if "depth" in name else 3
+                    want = rays[name].reshape(value.shape)
+                    np.testing.assert_allclose(value, want, rtol=0, atol=60 * unit * 2**-24, err_msg=name)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_ray_that_ends_ends_no_other(isa, degree):
+    """A board before a haze covers half of every patch, and most of some: the other pixels see the haze."""
+    octree = random_octree("single", degree, np.random.default_rng(0))
+    cells = [(x, y, z) for x in range(64) for y in range(64) for z in (10, 40) if z == 10 or (x * y) % 3 == 1]
+    octree = octree.from_leaves(np.full(len(cells), 6), np.array(cells), (-1.0, -1.0, -1.0), 2.0, degree, 100.0)
+    board = octree.vertex_positions()[:, 2] > 0
+    octree.density = np.where(board, 50.0, 0.2)
+    lens = Intrinsics(64, 64, 90.0, 90.0, 32, 32)
+    c2w = np.column_stack([np.eye(3), [0.0, 0.0, 3.0]])
+    d = lens.directions()
+    seen = ops.render_view(octree, ops.View(ops.in_squares(d), c2w, 64, 64), (1, 1, 1), 1e-2, ("opacity",))["opacity"]
+    o = np.broadcast_to(np.float32([0, 0, 3]), (64 * 64, 3)).copy()
+    want = ops.render_rays(octree, o, d.reshape(-1, 3), (1, 1, 1), 1e-2, ("opacity",))["opacity"].reshape(64, 64)
+    np.testing.assert_allclose(seen, want, rtol=0, atol=60 * 2**-24)
+    assert 0.1 < (seen > 0.99).mean() and 0.1 < ((seen > 0.1) & (seen < 0.9)).mean()
