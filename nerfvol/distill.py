@@ -25,6 +25,7 @@ from nerfvol.datasets import Dataset
 from nerfvol.errors import InputError
 from nerfvol.fields import Domain, RadianceField, SHField
 from nerfvol.kernels import ops
+from nerfvol.machine import return_free_memory
 from nerfvol.merge import merge_smooth
 from nerfvol.metrics import psnr
 from nerfvol.octree import EMPTY_DENSITY, OFFSETS, Octree, explin_inverse
@@ -88,6 +89,7 @@ def distill(
     messages: list[str] = []
     frame = Frame.of(domain, config.level)
     level, ijk = candidate_cells(field, frame, config, messages)
+    return_free_memory()
     octree = Octree.from_leaves(
         level, ijk, frame.origin.tolist(), frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
     )
@@ -95,6 +97,7 @@ def distill(
     candidates = octree.n_leaves
     octree = merge_smooth(octree, config.coarse_level, config.merge_tolerance)
     merged = octree.n_leaves
+    return_free_memory()
     if config.prune_weight > 0:
         weights = largest_weights(octree, dataset, background, config.visibility_downscale)
         keep = weights >= config.prune_weight
@@ -103,6 +106,7 @@ def distill(
                 "the field holds nothing that the training views can see; train it longer or use --init direct"
             )
         octree, _ = octree.prune(keep)
+    return_free_memory()
     scores = (math.nan, math.nan)
     if render_field is not None:
         scores = compare(octree, dataset, background, render_field, config)
@@ -235,15 +239,19 @@ def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int =
     np.minimum.at(spacing, octree.corners.reshape(-1), np.repeat(octree.leaf_sizes(), 8))
     to_sh = sh_of(field, octree.sh_degree)
     offsets = (OFFSETS - 0.5) / 2 if samples_per_vertex == 8 else np.zeros((1, 3))
-    sigma_sum = np.zeros(octree.n_vertices)
-    sh_sum = np.zeros((octree.n_vertices, 3 * spherical.basis_dim(octree.sh_degree)))
-    for offset in offsets:
-        rows = evaluate(to_sh, positions + spacing[:, None] * offset)
-        sigma_sum += rows[:, 0]
-        sh_sum += (rows[:, :1] + 1e-6) * rows[:, 1:]
-    octree.sh = (sh_sum / (sigma_sum + 1e-6 * len(offsets))[:, None]).reshape(octree.n_vertices, 3, -1)
-    # Beyond an optical thickness of 20 a leaf is opaque: larger numbers change nothing and are hard to optimise.
-    sigma = np.minimum(sigma_sum / len(offsets), 20 / spacing)
+    sigma = np.empty(octree.n_vertices)
+    sh = np.empty((octree.n_vertices, 3 * spherical.basis_dim(octree.sh_degree)), np.float32)
+    for start in range(0, octree.n_vertices, _CHUNK):  # a part at a time: sums take several times what is kept
+        part = slice(start, start + _CHUNK)
+        sigma_sum = sh_sum = 0.0
+        for offset in offsets:
+            rows = evaluate(to_sh, positions[part] + spacing[part, None] * offset).astype(np.float64)
+            sigma_sum = sigma_sum + rows[:, 0]
+            sh_sum = sh_sum + (rows[:, :1] + 1e-6) * rows[:, 1:]
+        sh[part] = sh_sum / (sigma_sum + 1e-6 * len(offsets))[:, None]
+        # Beyond an optical thickness of 20 a leaf is opaque: larger numbers change nothing and are hard to optimise.
+        sigma[part] = np.minimum(sigma_sum / len(offsets), 20 / spacing[part])
+    octree.sh = sh.reshape(octree.n_vertices, 3, -1)
     octree.density = np.maximum(explin_inverse(np.maximum(sigma / octree.density_scale, 1e-30)), EMPTY_DENSITY)
 
 
@@ -289,8 +297,9 @@ def largest_weights(octree: Octree, dataset: Dataset, background: Sequence[float
     bank = TileBank(dataset, background, downscale)
     state = ops.TrainState(octree)
     options, still = ops.LossOptions(tuple(background), early_stop_eps=1e-3), ops.Rates(0.0, 0.0, 0.0)
-    for tiles in np.array_split(np.arange(bank.n_tiles), max(1, bank.n_tiles // 512)):
-        # A training step with rates of zero: it moves nothing and notes the weights.
+    for tiles in np.array_split(np.arange(bank.n_tiles), max(1, bank.n_tiles // 32)):
+        # A training step with rates of zero: it moves nothing and notes the weights. At this size of the images leaves are
+        # small, and what a tile leaves behind for the second phase of a step is large: few tiles at a time.
         batch = bank.batch(tiles, np.ones(len(tiles), dtype=np.float32))
         ops.train_step(octree, state, batch, options, still, bank.pixel_angle)
     return state.max_weight

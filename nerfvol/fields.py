@@ -5,8 +5,12 @@ coordinates; ``sigma`` is in 1/u of the scene; colour is 1/2 + sum_k sh_k Y_k(d)
 (``nerfvol.sh``), and in (0, 1) where it is a view-dependent network.
 """
 
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -74,6 +78,25 @@ class Domain:
         size = x.abs()
         bent = torch.where(size <= 1, x, x.sign() * (2 - 1 / size.clamp(min=1)))
         return (bent / (2 - 1 / self.outer)).clamp(-1, 1)
+
+
+ROWS = 2048
+"""Networks are evaluated for a multiple of so many points. The library of matrix products (oneDNN) compiles and keeps code
+for each new number of rows: points as many as the rays happen to have took 0.7 GB of it and a seventh of the time."""
+
+
+def _in_whole_rows(evaluate: Callable[..., Any]) -> Callable[..., Any]:
+    """``evaluate(field, *inputs)`` with inputs (n, 3) filled up to a multiple of ROWS, and results of n rows again."""
+
+    @functools.wraps(evaluate)
+    def padded(field: NeuralField, *inputs: Tensor) -> Any:
+        n = len(inputs[0])
+        if n % ROWS == 0:
+            return evaluate(field, *inputs)
+        out = evaluate(field, *(functional.pad(x, (0, 0, 0, -n % ROWS)) for x in inputs))
+        return tuple(rows[:n] for rows in out) if isinstance(out, tuple) else out[:n]
+
+    return padded
 
 
 class _TruncatedExp(torch.autograd.Function):
@@ -152,10 +175,12 @@ class NeuralField(nn.Module):
         activated = truncated_exp(raw) if self.shape.density == "exp" else functional.softplus(raw)
         return activated * self.density_scale
 
+    @_in_whole_rows
     def density(self, positions: Tensor) -> Tensor:
         """(n, 3) -> sigma (n,) in 1/u."""
         return self._features(positions)[0]
 
+    @_in_whole_rows
     def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """(n, 3) -> sigma (n,), sh (n, 3, basis_dim); only with the SH head."""
         if self.shape.head != "sh":
@@ -163,6 +188,7 @@ class NeuralField(nn.Module):
         sigma, flat = self._features(positions)
         return sigma, flat.reshape(len(flat), 3, spherical.basis_dim(self.sh_degree)).to(sigma.dtype)
 
+    @_in_whole_rows
     def forward(self, positions: Tensor, viewdirs: Tensor) -> tuple[Tensor, Tensor]:
         """(n, 3), (n, 3) unit -> sigma (n,) in 1/u, rgb (n, 3)."""
         if self.shape.head == "sh":
