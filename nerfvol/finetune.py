@@ -16,6 +16,7 @@ import numpy as np
 from nerfvol.datasets import Dataset, SceneBounds
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
+from nerfvol.machine import return_free_memory
 from nerfvol.memory import splits_within
 from nerfvol.octree import Octree, Transfer, convert_rows
 from nerfvol.tiles import Cursor, TileBank
@@ -72,7 +73,7 @@ class OctreeConfig:
     """Stages split all leaves larger than this many pixels of their images in some view, down to their level, until ..."""
     fine_from: int = 9
     """... this level; from there on a stage splits leaves once, ..."""
-    subdivide_pixels: float = 1.0
+    subdivide_pixels: float = 1.5
     """... those larger than this many pixels ..."""
     subdivide_error: float = 0.7
     """... that are among the fewest to hold this share of the squared error."""
@@ -249,20 +250,27 @@ class OctreeTrainer:
         self._change(*self.octree.prune(keep))
         return error, footprint
 
-    def finished(self) -> Octree:
-        """The octree without the leaves that no picture misses: see ``final_prune_weights``."""
+    def finish(self) -> Octree:
+        """The octree without the leaves that no picture misses: see ``final_prune_weights``. Ends the training.
+
+        A second octree stands beside the first while they are compared; moments and tiles are let go before.
+        """
         if self.bank is None or not self._seen_enough():
             return self.octree
         rng = np.random.default_rng(self.seed)
         tiles = self.bank.rich_tiles if len(self.bank.rich_tiles) else self.bank.plain_tiles
         tiles = rng.choice(tiles, min(len(tiles), FINAL_TILES), replace=False)
         batch = self.bank.batch(tiles, np.ones(len(tiles), np.float32))
+        max_weight, self.bank = self.state.max_weight, None
+        del self.state, tiles
+        return_free_memory()
         most = self._squared_error(self.octree, batch) * (1 + self.config.final_prune_loss)
         for weight in self.config.final_prune_weights:
-            keep = self.state.max_weight >= weight
+            keep = max_weight >= weight
             if not keep.any():
                 continue
-            pruned, _ = self.octree.prune(keep)
+            pruned = None  # one at a time
+            pruned = self.octree.prune(keep)[0]
             if self._squared_error(pruned, batch) <= most:
                 return pruned
         return self.octree

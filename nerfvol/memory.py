@@ -19,6 +19,8 @@ from nerfvol.octree import BLOCKS
 BASE_BYTES = 400 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
 lego's 5-minute run has at its peak (1.12 to 1.22 GiB) beside the arrays named below."""
+FIELD_BYTES = 320 << 20
+"""torch, the code that it compiles and what the training of a field and its distillation leave behind: measured."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
@@ -30,8 +32,10 @@ CHANGE_BYTES_PER_LEAF = 59 - 24 + 11 + 84
 and slots: 24 with the vertices'), what describes the change (parent 4, octant 1, source and place of 1.32 vertices 5 each)
 and the new rows of values (64 a vertex), where 1.32 vertices stay for each leaf that was; the second moments follow when
 the old values are gone. A split needs less: the octree before it is a fraction of the one after it."""
-TILE_BYTES_PER_PIXEL = 3.25
-"""Per training pixel: 8-bit RGB, and a 64th of a tile's image, number, place in a queue (int32 each) and colour (bool)."""
+RICH_BYTES_PER_PIXEL = 3
+"""Per training pixel in a tile that is not plain background: 8-bit RGB."""
+TILE_BYTES_PER_PIXEL = 0.33
+"""Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool)."""
 LEAVES_PER_PIXEL = 2.1
 """Leaves of an octree split where it pays, for each pixel of one view: 1.32 million for lego at 800x800. Thick media have
 several times as many."""
@@ -39,6 +43,19 @@ MOST_LEAVES = 1 << 27
 """Eight corners each are numbered with 31 bits."""
 SHARE = 0.9
 """Of the memory at hand that a run may plan for."""
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What a run holds beside the octree and its training images.
+
+    rich_share: of the training tiles, those that are not plain background. held_out_bytes: of images. field: whether the
+    octree comes from a field.
+    """
+
+    rich_share: float = 1.0
+    held_out_bytes: int = 0
+    field: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,18 +88,24 @@ def octree_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> 
     return int(LEAF_BYTES * leaves + (VERTEX_BYTES + rows) * count)
 
 
-def estimate_training(dataset: Dataset, leaves: int, sh_degree: int, held_out_bytes: int = 0) -> MemoryEstimate:
-    """What training an octree of at most ``leaves`` leaves on ``dataset`` takes, beside ``held_out_bytes`` of images.
+def estimate_training(
+    dataset: Dataset, leaves: int, sh_degree: int, beside: Beside | None = None, vertices: int | None = None
+) -> MemoryEstimate:
+    """What training an octree of at most ``leaves`` leaves on ``dataset`` takes.
 
-    The octree is largest when the training images stand in tiles and their files' pixels were let go; these count
-    where they are more than what the octree still has to grow by, or cannot be let go.
+    ``vertices`` None: VERTICES_PER_LEAF. The octree is largest when the training images stand in tiles and their files'
+    pixels were let go; these count where they are more than what the octree still has to grow by, or cannot be let go.
     """
+    beside = beside or Beside()
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
-    growth = 0 if dataset.reload is None else CHANGE_BYTES_PER_LEAF * leaves + octree_bytes(leaves, sh_degree) // 2
+    octree = octree_bytes(leaves, sh_degree, vertices)
+    growth = 0 if dataset.reload is None else CHANGE_BYTES_PER_LEAF * leaves + octree // 2
     return MemoryEstimate(
-        base=BASE_BYTES,
-        images=int(TILE_BYTES_PER_PIXEL * pixels) + held_out_bytes + max(0, dataset.nbytes - growth),
-        octree=octree_bytes(leaves, sh_degree),
+        base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
+        images=int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
+        + beside.held_out_bytes
+        + max(0, dataset.nbytes - growth),
+        octree=octree,
         change=CHANGE_BYTES_PER_LEAF * leaves,
         leaves=leaves,
     )
@@ -99,7 +122,7 @@ def require_memory(estimate: MemoryEstimate, available: int | None = None) -> No
 
 
 def affordable_leaves(
-    dataset: Dataset, sh_degree: int, least: int = 1 << 18, available: int | None = None, held_out_bytes: int = 0
+    dataset: Dataset, sh_degree: int, least: int = 1 << 18, available: int | None = None, beside: Beside | None = None
 ) -> int:
     """The most leaves with which training fits in the memory at hand; MOST_LEAVES where nobody tells how much that is.
 
@@ -109,11 +132,11 @@ def affordable_leaves(
     free = available_memory() if available is None else available
     if free is None:
         return MOST_LEAVES
-    require_memory(estimate_training(dataset, least, sh_degree, held_out_bytes), free)
+    require_memory(estimate_training(dataset, least, sh_degree, beside), free)
     low, high = least, MOST_LEAVES
     while high - low > 1:
         middle = (low + high) // 2
-        fits = estimate_training(dataset, middle, sh_degree, held_out_bytes).peak <= SHARE * free
+        fits = estimate_training(dataset, middle, sh_degree, beside).peak <= SHARE * free
         low, high = (middle, high) if fits else (low, middle)
     return low
 

@@ -29,8 +29,9 @@ from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder
 from nerfvol.kernels import ops
 from nerfvol.machine import process_seconds, return_free_memory
-from nerfvol.memory import affordable_leaves, estimate_training, largest_octree
+from nerfvol.memory import Beside, affordable_leaves, estimate_training, largest_octree
 from nerfvol.metrics import ssim
+from nerfvol.tiles import rich_share
 
 FIELD_SHARE = 0.3
 """Of a time budget, the most that the field gets."""
@@ -74,6 +75,9 @@ class Phase(Protocol):
     def n_leaves(self) -> int:
         """Of the octree that there is so far."""
         ...
+
+    @property
+    def n_vertices(self) -> int: ...
 
     def size(self) -> str:
         """How large the representation is, in words."""
@@ -122,10 +126,13 @@ class Run:
             print(message)
         require_something(self.dataset, config.background)
         lens = self.dataset.cameras[0].intrinsics
-        held, degree = self.held_out.nbytes, max(config.octree.sh_degree, config.octree.final_sh_degree)
+        self._degree = max(config.octree.sh_degree, config.octree.final_sh_degree)
+        share = rich_share(self.dataset, config.background)
+        self._beside = Beside(share, self.held_out.nbytes, field=config.init == "mlp")
         wanted = largest_octree(config.octree.levels, lens.width * lens.height)
-        self.max_leaves = affordable_leaves(self.dataset, degree, least=min(wanted, 1 << 18), held_out_bytes=held)
-        estimate = estimate_training(self.dataset, min(wanted, self.max_leaves), degree, held)
+        self.max_leaves = affordable_leaves(self.dataset, self._degree, least=min(wanted, 1 << 18), beside=self._beside)
+        self._reckoned = min(wanted, self.max_leaves)
+        estimate = estimate_training(self.dataset, self._reckoned, self._degree, self._beside)
         print(f"{len(self.dataset)} training views of {lens.width}x{lens.height}, {len(self.held_out)} held out; "
               f"memory: {estimate.sentence()}", flush=True)  # fmt: skip
         self.preview_folder = ensure_writable_folder(self.folder / runs.PREVIEWS)
@@ -207,9 +214,17 @@ class Run:
         self._last_save = time.perf_counter()
 
     def enter_stage(self, phase: Phase) -> None:
-        """What a change of the phase's stage brings: images that are needed no more, another time to finish."""
+        """What a change of the phase's stage brings: images that are needed no more, another time to finish.
+
+        And another estimate of the memory, where the octree has more leaves than the first one reckoned with: a surface
+        has about so many, a thick medium several times as many.
+        """
         self.release_images(phase)
         return_free_memory()
+        if phase.n_leaves > self._reckoned:
+            self._reckoned = phase.n_leaves
+            estimate = estimate_training(self.dataset, self._reckoned, self._degree, self._beside, phase.n_vertices)
+            print(f"memory: the octree is larger than was reckoned with; now {estimate.sentence()}", flush=True)
         self._reserve = self._time_to_finish(phase)
 
     def release_images(self, phase: Phase) -> None:

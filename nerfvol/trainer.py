@@ -157,7 +157,7 @@ class FieldPhase:
     name = "field"
     previews = (0.1, 0.4, 1.0)
     preview_width = 100  # a field renders slowly
-    stages_left = n_leaves = 0
+    stages_left = n_leaves = n_vertices = 0
 
     def __init__(self, run: Run) -> None:
         from nerfvol.train_field import FieldTrainer
@@ -228,7 +228,7 @@ class OctreePhase:
 
     def take_octree(self) -> Octree:
         """The finished octree; tiles, moments and statistics are let go."""
-        octree = self.trainer.finished()
+        octree = self.trainer.finish()
         del self.trainer
         return_free_memory()
         return octree
@@ -236,6 +236,10 @@ class OctreePhase:
     @property
     def n_leaves(self) -> int:
         return self.trainer.octree.n_leaves
+
+    @property
+    def n_vertices(self) -> int:
+        return self.trainer.octree.n_vertices
 
     def size(self) -> str:
         return f"{self.n_leaves:,} leaves"

@@ -1,12 +1,14 @@
 """Time budgets: every stage gets its share, scoring is paid for, earlier sessions count."""
 
 import json
+import re
 import time
 
 import pytest
 from tiny_runs import TINY, Pretended, log_of, settings, start
 
 from nerfvol import cli, runs, session
+from nerfvol.memory import estimate_training, octree_bytes
 from nerfvol.octree_io import load_octree
 
 
@@ -65,10 +67,31 @@ def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
     octree = Pretended("octree")
     assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 2.2 * (1 + 1600e-7))
     octree.picture, octree.stage, octree.trainer, octree.n_leaves = picture, 0, Pretended("trainer"), 3_000_000
+    octree.n_vertices = 4_000_000
     octree.trainer.bank = None
     run.enter_stage(octree)
     writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 3_000_000
     assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 2.2 * (1 + 11))
+
+
+def test_memory_is_announced_anew_where_the_octree_outgrows_the_estimate(tmp_path, tiny_scene, capsys):
+    """With the vertices that it has; once for each larger octree, and not for one that is as large as was said."""
+    run = session.Run(settings(tiny_scene, tmp_path), session.Clock(0.0, 0.0), None)
+    said = int(re.search(r"up to ([\d,]+) leaves", capsys.readouterr().out)[1].replace(",", ""))
+    octree = Pretended("octree")
+    octree.stage, octree.trainer = 0, Pretended("trainer")
+    octree.trainer.bank = None
+    for leaves, vertices, reckoned in [(said, 1, None), (said + 1, 10**6, said + 1), (said + 1, 10**6, None),
+                                       (10**6, 2 * 10**6, 10**6)]:  # fmt: skip
+        octree.n_leaves, octree.n_vertices = leaves, vertices
+        run.enter_stage(octree)
+        printed = capsys.readouterr().out
+        if reckoned is None:
+            assert printed == ""
+        else:
+            estimate = estimate_training(run.dataset, reckoned, 1, run._beside, vertices)
+            assert printed == f"memory: the octree is larger than was reckoned with; now {estimate.sentence()}\n"
+            assert estimate.octree == octree_bytes(leaves, 1, vertices)
 
 
 def test_a_budget_is_kept(tmp_path, tiny_scene):

@@ -56,21 +56,21 @@ def finished_trainer(tiny_scene, weight_of_needed: float) -> tuple[OctreeTrainer
 def test_the_last_pruning_takes_what_no_picture_misses(tiny_scene):
     """The largest threshold that costs nothing: 0.04 would take what is needed, 0.02 takes the rest, 0.01 nothing."""
     tuner, needed = finished_trainer(tiny_scene, 0.03)
-    assert ((tuner.finished().query(tuner.octree.leaf_centers()) >= 0) == needed).all()
+    assert ((tuner.finish().query(tuner.octree.leaf_centers()) >= 0) == needed).all()
 
 
 def test_the_last_pruning_leaves_what_pictures_miss(tiny_scene):
     """In thick media every leaf weighs little: all claim too small a weight, and none may go for it."""
     tuner, _ = finished_trainer(tiny_scene, 0.001)
     tuner.state.max_weight[::2] = 1.0  # half would stay
-    assert tuner.finished() is tuner.octree
+    assert tuner.finish() is tuner.octree
 
 
 def test_the_last_pruning_needs_to_have_seen_enough(tiny_scene):
     """Right after a pruning nothing is known of what rays need."""
     tuner, _ = finished_trainer(tiny_scene, 0.03)
     tuner.tiles_seen = 0
-    assert tuner.finished() is tuner.octree
+    assert tuner.finish() is tuner.octree
 
 
 def test_the_last_stage_has_more_bands(tiny_scene):

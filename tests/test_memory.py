@@ -12,6 +12,7 @@ from nerfvol.datasets import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.memory import (
+    Beside,
     affordable_leaves,
     estimate_training,
     largest_octree,
@@ -79,10 +80,12 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
 
 
 def test_images_count(dataset):
-    tiles = int(memory.TILE_BYTES_PER_PIXEL * 12 * 40 * 40)
-    assert estimate_training(dataset, 0, 1).images == 4 * 12 * 40 * 40 + tiles
+    pixels = 12 * 40 * 40
+    assert estimate_training(dataset, 0, 1).images == int(3.33 * pixels) + 4 * pixels
     # once the octree is larger than the images that were let go, these count no more
-    assert estimate_training(dataset, 10**6, 1, held_out_bytes=77).images == tiles + 77
+    assert estimate_training(dataset, 10**6, 1, Beside(0.5, 77)).images == int(1.83 * pixels) + 77
+    plain, field = (estimate_training(dataset, 10**6, 1, Beside(field=field)) for field in (False, True))
+    assert field.peak == plain.peak + memory.FIELD_BYTES
 
 
 def test_an_octree_is_bounded_by_its_surface_the_pixels_and_its_start():

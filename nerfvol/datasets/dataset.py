@@ -74,8 +74,8 @@ class Dataset:
 
     @property
     def nbytes(self) -> int:
-        """Bytes the images hold."""
-        return sum(image.nbytes for image in self.images)
+        """Bytes the images hold; 0 where they were let go."""
+        return sum(image.nbytes for image in vars(self).get("images", ()))
 
     def release(self) -> None:
         """Let the images' memory go, where they can be read again: whoever asks for ``images`` next does so."""
