@@ -42,8 +42,8 @@ class OctreeConfig:
     """Pruning waits until this share of the tiles that are not plain background was seen (see _seen_enough for the cap)."""
     prune_steps: int = 20
     """... and this many steps were made: a thin start needs some to become visible at all, however few the pictures."""
-    sh_degree: int = 1
-    """Spherical harmonics of the colours: 0 to 3."""
+    sh_degree: int | None = None
+    """Spherical harmonics of the colours: 0 to 3. None: 1, and 2 in photographs, whose surfaces shine."""
     final_sh_degree: int = 1
     """... in the last stage, where it is more: for shiny scenes. It costs memory and steps (docs/performance.md)."""
     rich_share: float = 0.8
@@ -57,10 +57,10 @@ class OctreeConfig:
     rate_density: float = 0.3
     rate_dc: float = 0.07
     rate_sh: float = 0.006
-    rate_decay: float = 0.04
-    """Learning rates shrink exponentially to this factor ..."""
-    decay_from: float = 0.8
-    """... from this share of progress on."""
+    rate_decay: float | None = None
+    """Learning rates shrink exponentially to this factor ... None: 0.04, and 0.02 in photographs."""
+    decay_from: float | None = None
+    """... from this share of progress on. None: 0.8, and 0.35 in photographs, whose noise takes longer to average."""
     beta: float = 0.98
     prune_weight: float = 0.005
     """Leaves whose largest rendering weight since the last pruning is below are removed."""
@@ -82,6 +82,18 @@ class OctreeConfig:
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""
 
+    def for_scene(self, scene: SceneBounds) -> OctreeConfig:
+        """The same with a number for each None; photographs are scenes with surroundings."""
+        automatic = BOUNDED if scene.background_cube is None else PHOTOGRAPHS
+        return dataclasses.replace(
+            self, **{name: value for name, value in automatic.items() if getattr(self, name) is None}
+        )
+
+
+BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8}
+PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35}
+"""Settings of an octree where nothing else is said."""
+
 
 FINAL_TILES = 4096
 """Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
@@ -93,6 +105,7 @@ class OctreeTrainer:
     def __init__(
         self, dataset: Dataset, background: Sequence[float], config: OctreeConfig, seed: int, octree: Octree | None
     ):
+        config = config.for_scene(dataset.scene)
         n = len(config.levels)
         for name in ("downscales", "until", "tiles", "prunes"):
             if len(getattr(config, name)) != n:

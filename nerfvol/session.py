@@ -125,6 +125,7 @@ class Run:
         for message in self.dataset.messages:
             print(message)
         require_something(self.dataset, config.background)
+        self.config = config = dataclasses.replace(config, octree=config.octree.for_scene(self.dataset.scene))
         lens = self.dataset.cameras[0].intrinsics
         self._degree = max(config.octree.sh_degree, config.octree.final_sh_degree)
         share = rich_share(self.dataset, config.background)

@@ -1,5 +1,7 @@
 """Coarse to fine: when leaves go and when they are split."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -111,3 +113,24 @@ def test_the_last_stage_has_more_bands(tiny_scene):
 def test_settings_that_mean_nothing_are_refused(tiny_scene, setting, expected):
     with pytest.raises(InputError, match=f"octree.{expected}"):
         OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), OctreeConfig(**setting), 0, None)
+
+
+def test_photographs_have_settings_of_their_own(tiny_scene):
+    """Where nothing else is said; a scene with surroundings is one of photographs."""
+    objects = load_dataset(tiny_scene, "train").scene
+    photographs = dataclasses.replace(objects, background_cube=8 * objects.aabb)
+    chosen = [OctreeConfig().for_scene(scene) for scene in (objects, photographs)]
+    assert [(c.sh_degree, c.rate_decay, c.decay_from) for c in chosen] == [(1, 0.04, 0.8), (2, 0.02, 0.35)]
+    said = OctreeConfig(sh_degree=0, rate_decay=0.5, decay_from=0.1)
+    assert said.for_scene(photographs) == said == said.for_scene(objects)
+
+
+def test_a_run_has_the_settings_of_its_scene(tiny_scene):
+    dataset = load_dataset(tiny_scene, "train")
+    photographs = dataclasses.replace(
+        dataset, scene=dataclasses.replace(dataset.scene, background_cube=8 * dataset.scene.aabb)
+    )
+    config = OctreeConfig(levels=[3], downscales=[4], until=[1.0], tiles=[8], prunes=[0])
+    for images, degree in [(dataset, 1), (photographs, 2)]:
+        trainer = OctreeTrainer(images, (1, 1, 1), config, 0, None)
+        assert trainer.octree.sh_degree == degree
