@@ -36,8 +36,8 @@ RICH_BYTES_PER_PIXEL = 3
 """Per training pixel in a tile that is not plain background: 8-bit RGB."""
 TILE_BYTES_PER_PIXEL = 0.33
 """Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool)."""
-LEAVES_PER_PIXEL = 2.1
-"""Leaves of an octree split where it pays, for each pixel of one view: 1.32 million for lego at 800x800. Thick media have
+LEAVES_PER_PIXEL = 2.2
+"""Leaves of an octree split where it pays, for each pixel of one view: 1.38 million for lego at 800x800. Thick media have
 several times as many."""
 MOST_LEAVES = 1 << 27
 """Eight corners each are numbered with 31 bits."""

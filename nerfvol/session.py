@@ -120,7 +120,12 @@ class Run:
         self.steps: dict[str, int] = self.saved["steps"]
         self.phase_started, self.running = 0.0, math.nan
         self.interrupted = False
+        loading = time.perf_counter()
         self.held_out = some_views(load_dataset(config.data, "val", config.downscale), LARGEST_HELD_OUT)
+        self._few = some_views(self.held_out, config.compare_views)
+        self._first = some_views(self.held_out, 1)
+        self.held_out.release()  # until they are scored
+        self._loading = time.perf_counter() - loading
         self.dataset = load_dataset(config.data, "train", config.downscale)
         for message in self.dataset.messages:
             print(message)
@@ -129,7 +134,8 @@ class Run:
         lens = self.dataset.cameras[0].intrinsics
         self._degree = max(config.octree.sh_degree, config.octree.final_sh_degree)
         share = rich_share(self.dataset, config.background)
-        self._beside = Beside(share, self.held_out.nbytes, field=config.init == "mlp")
+        held = self.held_out.nbytes or self._first.nbytes + self._few.nbytes  # views of it share its images
+        self._beside = Beside(share, held, field=config.init == "mlp")
         wanted = largest_octree(config.octree.levels, lens.width * lens.height)
         self.max_leaves = affordable_leaves(self.dataset, self._degree, least=min(wanted, 1 << 18), beside=self._beside)
         self._reckoned = min(wanted, self.max_leaves)
@@ -236,7 +242,7 @@ class Run:
 
     def preview(self, phase: Phase, moment: float) -> None:
         """The first held-out view, small: truth beside what the phase has."""
-        camera, image = self.held_out.cameras[0], self.held_out.images[0]
+        camera, image = self._first.cameras[0], self._first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
         truth = composite_average(image, self.config.background, k).astype(np.float32) / 255
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
@@ -268,7 +274,7 @@ class Run:
 
     def comparison_views(self) -> Dataset:
         """The held-out views on which field, distilled and fine-tuned octree are compared."""
-        return some_views(self.held_out, self.config.compare_views)
+        return self._few
 
     def metadata(self) -> dict[str, Any]:
         """What the octree file says of itself; no clock and no machine in it, so that equal runs write equal files."""
@@ -279,11 +285,14 @@ class Run:
         return {"provenance": provenance, "background": list(config.background), "orbit": orbit}
 
     def _time_to_finish(self, phase: Phase | None = None) -> float:
-        """Seconds to keep for writing and scoring: scoring measured on one view; without a phase, the rest is guessed."""
+        """Seconds to keep for writing, reading the views and scoring.
+
+        Reading took a time at the start, scoring is measured on one view; without a phase, the rest is guessed.
+        """
         if self.config.time_budget is None:
             return 0.0
         started = time.perf_counter()
-        image = self.held_out.composited(0, self.config.background)
+        image = self._first.composited(0, self.config.background)
         ssim(image, image)
         scoring = (time.perf_counter() - started) / ops.get_threads()  # so many views are scored side by side
         started = time.perf_counter()
@@ -292,7 +301,7 @@ class Run:
         rendering = 0.1e-6 * image.size / 3 if phase is None else time.perf_counter() - started
         views = len(self.held_out) + (self.config.compare_views if self.stages else 0)
         writing = FINISH_SECONDS + FINISH_SECONDS_PER_LEAF * (1_000_000 if phase is None else phase.n_leaves)
-        return min(writing + 1.1 * views * (scoring + rendering), RESERVE_SHARE * self.config.time_budget)
+        return min(writing + self._loading + 1.1 * views * (scoring + rendering), RESERVE_SHARE * self.config.time_budget)
 
 
 def require_something(dataset: Dataset, background: Sequence[float]) -> None:

@@ -52,8 +52,8 @@ inline void load_square(const Tree& tree, const View& view, int64_t row, int64_t
 
 // Hits that wait to be composited, front to back: extinction is dear and worked out for sixteen at a time, while a leaf
 // is met by three rays on average. A ray that ends leaves a few hits behind here, which are dropped.
-template <int S> struct Waiting {
-    static constexpr int kCapacity = (S + 3) * kTile;
+struct Waiting {
+    static constexpr int kCapacity = 2 * kTile;  // small, to stay in the core's nearest cache
     int first = 0, end = 0;
     int32_t lane[kCapacity];
     f4 value[kCapacity];                   // r, g, b, distance
@@ -62,9 +62,9 @@ template <int S> struct Waiting {
 
     int size() const { return end - first; }
 
-    // Makes room for a leaf's hits behind those that wait.
+    // Makes room for a strip's hits behind those that wait.
     void make_room(bool with_slopes) {
-        if (end + S * kTile <= kCapacity) return;
+        if (end + kTile <= kCapacity) return;
         const auto forward = [&](auto* rows) { std::memmove(rows, rows + first, size() * sizeof(*rows)); };
         forward(lane); forward(value); forward(raw); forward(length);
         if (with_slopes) forward(slope);
@@ -93,7 +93,7 @@ inline float median_distance(float before, float raw, float length, float middle
 
 // Composites the first `m` <= 64 of the hits that wait.
 template <int S>
-void composite(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, Waiting<S>& waiting, int m,
+void composite(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, Waiting& waiting, int m,
                PacketState<S>& state, Extras<S>& extras) {
     Extinction x;
     x.evaluate(waiting.raw + waiting.first, waiting.length + waiting.first, m, tree.density_scale, false);
@@ -149,18 +149,18 @@ void write_window(const Window& to, const PacketState<S>& state, const Extras<S>
 template <int B, int S>
 void render_packet(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, const Window& to) {
     BasisRows<B> basis[S];
-    bool has_basis = false;                // most packets of a picture meet nothing
+    bool has_basis[S] = {};                // many strips of a picture meet nothing
     PacketState<S> state;
-    Waiting<S> waiting;
+    Waiting waiting;
     Extras<S> extras;
     march<B>(tree, p, [&](const Leaf&, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
-        if (!has_basis)
-            for (int s = 0; s < S; ++s) basis[s].fill(p.strips[s], tree.sh_degree);
-        has_basis = true;
-        waiting.make_room(out.normal);
-        int i = waiting.end;
         for (int s = 0; s < S; ++s) {
+            if (!hits[s]) continue;
             const Segments& at = segments[s];
+            if (!has_basis[s]) basis[s].fill(p.strips[s], tree.sh_degree);
+            has_basis[s] = true;
+            waiting.make_room(out.normal);
+            int i = waiting.end;
             for (uint64_t h = hits[s]; h; h &= h - 1, ++i) {
                 const int l = __builtin_ctzll(h);
                 f4 value = field.at(at.fx[l], at.fy[l], at.fz[l], basis[s].row[l]);
@@ -172,9 +172,9 @@ void render_packet(const Tree& tree, Packet<S>& p, const RenderOptions& options,
                 waiting.length[i] = at.length[l] * tree.size;
                 if (out.normal) field.density_slope(at.fx[l], at.fy[l], at.fz[l], waiting.slope[i]);
             }
+            waiting.end = i;
+            if (waiting.size() >= 16) composite(tree, p, options, out, waiting, std::min(waiting.size() & ~15, kTile), state, extras);
         }
-        waiting.end = i;
-        while (waiting.size() >= 16) composite(tree, p, options, out, waiting, std::min(waiting.size() & ~15, kTile), state, extras);
     });
     composite(tree, p, options, out, waiting, waiting.size(), state, extras);
     write_window(to, state, extras, options, out);
