@@ -41,6 +41,8 @@ FINISH_SECONDS = 0.5
 """Of writing, beside ..."""
 FINISH_SECONDS_PER_LEAF = 1.5e-6
 """... writing and reading an octree in compact storage (two cores of 2023); a run that takes longer ends later."""
+HELD_OUT_KEPT = 32 << 20
+"""Bytes of held-out images that a run keeps; more are read once again to be scored."""
 LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
 RUNNING = 0.98
@@ -124,8 +126,10 @@ class Run:
         self.held_out = some_views(load_dataset(config.data, "val", config.downscale), LARGEST_HELD_OUT)
         self._few = some_views(self.held_out, config.compare_views)
         self._first = some_views(self.held_out, 1)
-        self.held_out.release()  # until they are scored
-        self._loading = time.perf_counter() - loading
+        self._loading = 0.0
+        if self.held_out.nbytes > HELD_OUT_KEPT:  # else let go until they are scored
+            self.held_out.release()
+            self._loading = time.perf_counter() - loading
         self.dataset = load_dataset(config.data, "train", config.downscale)
         for message in self.dataset.messages:
             print(message)
