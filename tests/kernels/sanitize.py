@@ -16,7 +16,7 @@ from pathlib import Path
 from own_build import build_kernels, run_tests
 
 # Every build of every kernel: images, gradients, steps, determinism (threads) and the refusals.
-TESTS = ("test_ops.py", "test_train.py", "test_determinism.py", "test_checks.py")
+TESTS = ("test_ops.py", "test_train.py", "test_determinism.py", "test_checks.py", "test_view.py")
 
 
 def runtime(compiler: str) -> str:
