@@ -305,7 +305,9 @@ class Run:
         rendering = 0.1e-6 * image.size / 3 if phase is None else time.perf_counter() - started
         views = len(self.held_out) + (self.config.compare_views if self.stages else 0)
         writing = FINISH_SECONDS + FINISH_SECONDS_PER_LEAF * (1_000_000 if phase is None else phase.n_leaves)
-        return min(writing + self._loading + 1.1 * views * (scoring + rendering), RESERVE_SHARE * self.config.time_budget)
+        return min(
+            writing + self._loading + 1.1 * views * (scoring + rendering), RESERVE_SHARE * self.config.time_budget
+        )
 
 
 def require_something(dataset: Dataset, background: Sequence[float]) -> None:

@@ -47,8 +47,8 @@ def test_shares_of_a_budget(tmp_path, tiny_scene, monkeypatch):
 def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
     """By a clock that goes on a second at every look, with a picture that takes 10 more, on one thread.
 
-    Reading took one second. A view takes one second to score, and to render a guess of 0.1 microseconds a pixel before there is a picture and 11
-    seconds then. Two views are held out; a tenth is added for what else they need.
+    Reading took one second. A view takes one second to score, and to render a guess of 0.1 microseconds a pixel before there
+    is a picture and 11 seconds then. Two views are held out; a tenth is added for what else they need.
     """
     seconds = [0.0]
 

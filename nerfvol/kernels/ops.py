@@ -28,7 +28,6 @@ from nerfvol.kernels.state import (
     TrainState,
     View,
     from_squares,
-    in_squares,
 )
 from nerfvol.native import native
 from nerfvol.octree import BLOCKS, Octree
@@ -275,5 +274,3 @@ def train_step(
         state.footprint,
     )
     return StepReport(squared / max(3 * weight, 1e-30), samples / max(len(d), 1))
-
-

@@ -11,7 +11,6 @@ from nerfvol.native import aligned, aligned_empty
 from nerfvol.octree import Octree
 from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
 
-
 SQUARE = 16
 """Pixels along a square of a view: what the kernels render as one packet."""
 
