@@ -19,6 +19,7 @@ from nerfvol.cameras import Camera, Intrinsics
 from nerfvol.errors import InputError
 from nerfvol.files import ensure_writable_folder, write_json
 from nerfvol.kernels import ops
+from nerfvol.kernels.state import in_squares
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree
 from nerfvol.options import RenderOptions
@@ -50,7 +51,7 @@ def render_image(
 @functools.lru_cache(maxsize=1)
 def _directions(lens: Intrinsics) -> Float:
     """Unit directions in camera axes, as :class:`ops.View` has them. Kept for a path."""
-    return ops.in_squares(lens.directions())
+    return in_squares(lens.directions())
 
 
 def surface_depth(image: Mapping[str, Float]) -> Float:

@@ -29,9 +29,6 @@ from nerfvol.kernels.state import (
     View,
     from_squares,
 )
-from nerfvol.kernels.state import (
-    in_squares as in_squares,
-)
 from nerfvol.native import native
 from nerfvol.octree import BLOCKS, Octree
 

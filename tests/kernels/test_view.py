@@ -5,6 +5,8 @@ import pytest
 
 from nerfvol.cameras import Intrinsics
 from nerfvol.kernels import ops
+from nerfvol.kernels.state import from_squares, in_squares
+from nerfvol.octree import Octree
 from tests.kernels.trees import DYADIC, ODD, random_octree
 
 
@@ -21,19 +23,19 @@ def view_of(octree, rng, width, height, focal, away):
     lens = Intrinsics(width, height, focal, focal, 0.47 * width, 0.52 * height)
     directions = lens.directions()
     turned = directions.reshape(-1, 3) @ rotation.T.astype(np.float32)
-    view = ops.View(ops.in_squares(directions), c2w, height, width)
+    view = ops.View(in_squares(directions), c2w, height, width)
     return view, np.broadcast_to(c2w[:, 3].astype(np.float32), turned.shape).copy(), turned
 
 
 def test_squares_hold_each_pixel_where_the_kernels_look_for_it():
     """Strips of four rows; in a strip patches of 2x2 pixels, row by row; in a patch two above two."""
     rows, columns = np.meshgrid(np.arange(37), np.arange(21), indexing="ij")
-    squares = ops.in_squares(np.stack([rows, columns], -1))
+    squares = in_squares(np.stack([rows, columns], -1))
     assert squares.shape == (3, 2, 4, 2, 64)
     for at, place in [((0, 0, 0, 1), (0, 1)), ((0, 0, 0, 2), (1, 0)), ((0, 0, 0, 4), (0, 2)), ((0, 0, 0, 32), (2, 0)),
                       ((1, 0, 3, 63), (31, 15)), ((2, 1, 1, 0), (36, 16))]:  # fmt: skip
         assert tuple(squares[(*at[:3], slice(None), at[3])]) == place
-    assert np.array_equal(ops.from_squares(squares, 37, 21), np.stack([rows, columns], -1))
+    assert np.array_equal(from_squares(squares, 37, 21), np.stack([rows, columns], -1))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -58,16 +60,15 @@ def test_views_agree_with_rays(isa, kind, degree):
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_ray_that_ends_ends_no_other(isa, degree):
-    """A board before a haze covers half of every patch, and most of some: the other pixels see the haze."""
-    octree = random_octree("single", degree, np.random.default_rng(0))
+    """Two cells of nine of a board stand before a haze: pixels that see the haze share patches with pixels that end."""
     cells = [(x, y, z) for x in range(64) for y in range(64) for z in (10, 40) if z == 10 or (x * y) % 3 == 1]
-    octree = octree.from_leaves(np.full(len(cells), 6), np.array(cells), (-1.0, -1.0, -1.0), 2.0, degree, 100.0)
+    octree = Octree.from_leaves(np.full(len(cells), 6), np.array(cells), (-1.0, -1.0, -1.0), 2.0, degree, 100.0)
     board = octree.vertex_positions()[:, 2] > 0
     octree.density = np.where(board, 50.0, 0.2)
     lens = Intrinsics(64, 64, 90.0, 90.0, 32, 32)
     c2w = np.column_stack([np.eye(3), [0.0, 0.0, 3.0]])
     d = lens.directions()
-    seen = ops.render_view(octree, ops.View(ops.in_squares(d), c2w, 64, 64), (1, 1, 1), 1e-2, ("opacity",))["opacity"]
+    seen = ops.render_view(octree, ops.View(in_squares(d), c2w, 64, 64), (1, 1, 1), 1e-2, ("opacity",))["opacity"]
     o = np.broadcast_to(np.float32([0, 0, 3]), (64 * 64, 3)).copy()
     want = ops.render_rays(octree, o, d.reshape(-1, 3), (1, 1, 1), 1e-2, ("opacity",))["opacity"].reshape(64, 64)
     np.testing.assert_allclose(seen, want, rtol=0, atol=60 * 2**-24)
