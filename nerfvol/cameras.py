@@ -88,6 +88,14 @@ class Intrinsics:
             self, width=width, height=height, fx=self.fx / k, fy=self.fy / k, cx=self.cx / k, cy=self.cy / k
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> Intrinsics:
+        """The camera of the part of the image that begins at column ``left`` and row ``top``."""
+        if min(left, top) < 0 or left + width > self.width or top + height > self.height:
+            raise InputError(
+                f"{width}x{height} pixels from column {left} and row {top} on are no part of a {self.width}x{self.height} image"
+            )
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same field of view across the width at another size; another aspect ratio crops or extends the height."""
         s = width / self.width

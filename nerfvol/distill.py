@@ -23,13 +23,12 @@ from nerfvol import sh as spherical
 from nerfvol.cameras import Camera
 from nerfvol.datasets import Dataset
 from nerfvol.errors import InputError
+from nerfvol.evaluate import evaluate_octree, score_views
 from nerfvol.fields import Domain, RadianceField, SHField
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
 from nerfvol.merge import merge_smooth
-from nerfvol.metrics import psnr
 from nerfvol.octree import EMPTY_DENSITY, OFFSETS, Octree, explin_inverse
-from nerfvol.render import render_image
 from nerfvol.settings import DistillConfig
 from nerfvol.tiles import TileBank
 
@@ -86,9 +85,12 @@ def distill(
     Raises:
         InputError: the field is empty: nothing in it is as opaque as ``empty_opacity``.
     """
+    config = config.for_scene(dataset.scene)
     messages: list[str] = []
-    frame = Frame.of(domain, config.level)
+    frame = Frame.of(domain, cast(int, config.level))
     level, ijk = candidate_cells(field, frame, config, messages)
+    kept = ~dataset.before_a_lens(frame.origin + (ijk + 0.5) * (frame.size / 2.0**level)[:, None])
+    level, ijk = level[kept], ijk[kept]
     return_free_memory()
     octree = Octree.from_leaves(
         level, ijk, frame.origin.tolist(), frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
@@ -107,15 +109,17 @@ def distill(
             )
         octree, _ = octree.prune(keep)
     return_free_memory()
-    scores = (math.nan, math.nan)
+    field_psnr = octree_psnr = math.nan
     if render_field is not None:
-        scores = compare(octree, dataset, background, render_field, config)
+        few = dataset.evenly(config.compare_views).smaller(config.compare_downscale, background)
+        field_psnr = score_views(render_field, few, background)["psnr"]
+        octree_psnr = evaluate_octree(octree, few, background)["psnr"]
     levels, counts = np.unique(octree.leaf_level, return_counts=True)
     report = DistillReport(
         leaves=octree.n_leaves, vertices=octree.n_vertices,
         leaves_per_level=dict(zip(levels.tolist(), counts.tolist(), strict=True)),
         bytes=octree.values.nbytes + octree.corners.nbytes, candidates=candidates, merged=candidates - merged,
-        pruned=merged - octree.n_leaves, field_psnr=scores[0], octree_psnr=scores[1], messages=messages,
+        pruned=merged - octree.n_leaves, field_psnr=field_psnr, octree_psnr=octree_psnr, messages=messages,
     )  # fmt: skip
     return octree, report
 
@@ -162,39 +166,59 @@ def evaluate(function: Callable[[Tensor], Tensor], positions: np.ndarray) -> np.
 def candidate_cells(
     field: RadianceField, frame: Frame, config: DistillConfig, messages: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Levels (n,) and positions (n, 3) of the cells that may hold something, found from coarse to fine."""
-    start = max(1, config.coarse_level + frame.finest - config.level)
-    start = min(start, frame.finest, 6 if frame.finest > config.level else start)
-    cells = np.stack(np.meshgrid(*[np.arange(1 << start)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    threshold = -math.log1p(-config.empty_opacity)
-    done: list[tuple[int, np.ndarray]] = []
-    for level in range(start, frame.finest + 1):
-        wanted = frame.wanted_level(level, cells)
-        edge = frame.size / 2**level
-        per_axis = 4 if level == start else 2
-        sigmas = largest_sigma(field, frame.origin + cells * edge, edge, per_axis)
-        # Thickness of the leaf this cell would be cut into.
-        thickness = sigmas * (frame.size / 2.0 ** np.maximum(wanted, level))
-        room = config.max_leaves - sum(len(part) for _, part in done)
-        kept = dilated(cells, thickness > threshold, 1 << level)
-        while np.where(wanted[kept] <= level, 1, 8).sum() > room and (thickness[kept] > threshold).any():
+    """Levels (n,) and positions (n, 3) of the cells that may hold something, at most ``config.max_leaves``.
+
+    Where they do not fit, all leaves are made coarser: they hold all of a haze, and the octree's training splits them where
+    that pays. Only where the coarsest do not fit either, the thinnest are left out.
+    """
+    level, threshold = cast(int, config.level), -math.log1p(-config.empty_opacity)
+    start = max(1, config.coarse_level + frame.finest - level)
+    start = min(start, frame.finest, 6 if frame.finest > level else start)
+    while (found := _search(field, frame, start, threshold, config.max_leaves)) is None:
+        if level > config.coarse_level and frame.finest > start:
+            level, frame = level - 1, dataclasses.replace(frame, finest=frame.finest - 1)
+        else:
             threshold *= 2
-            kept = dilated(cells, thickness > threshold, 1 << level)
-        finished = wanted[kept] <= level
-        done.append((level, cells[kept][finished]))
-        cells = (2 * cells[kept][~finished][:, None] + OFFSETS).reshape(-1, 3)
+    if level < cast(int, config.level):
+        messages.append(
+            f"the field is hazy: with leaves smaller than 1/{1 << level} of the region of detail it would not fit into "
+            f"{config.max_leaves:,} leaves"
+        )
     if threshold > -math.log1p(-config.empty_opacity):
         messages.append(
             f"the field is hazy: only what is more opaque than {-math.expm1(-threshold):.2g} a leaf fits into "
-            f"{config.max_leaves} leaves"
+            f"{config.max_leaves:,} leaves"
         )
-    levels = np.concatenate([np.full(len(part), level) for level, part in done])
-    if not len(levels):
+    if not len(found[0]):
         raise InputError(
             "the field is empty: nothing in it is opaque enough for a leaf; train it longer, check the background "
             "colour and the scene bounds, or use --init direct"
         )
-    return levels, np.concatenate([part for _, part in done])
+    return found
+
+
+def _search(
+    field: RadianceField, frame: Frame, start: int, threshold: float, most: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Cells of an optical thickness above ``threshold`` and their neighbours, found from level ``start`` on; None: more
+    than ``most``."""
+    cells = np.stack(np.meshgrid(*[np.arange(1 << start)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    levels, done = [], []
+    for level in range(start, frame.finest + 1):
+        wanted = frame.wanted_level(level, cells)
+        edge = frame.size / 2**level
+        sigmas = largest_sigma(field, frame.origin + cells * edge, edge, per_axis=4 if level == start else 2)
+        # Thickness of the leaf this cell would be cut into.
+        thickness = sigmas * (frame.size / 2.0 ** np.maximum(wanted, level))
+        kept = dilated(cells, thickness > threshold, 1 << level)
+        finished = wanted[kept] <= level
+        most -= int(finished.sum())
+        if most < 4 * (~finished).sum():  # so many cells a surface has at half their size
+            return None
+        levels.append(np.full(finished.sum(), level))
+        done.append(cells[kept][finished])
+        cells = (2 * cells[kept][~finished][:, None] + OFFSETS).reshape(-1, 3)
+    return np.concatenate(levels), np.concatenate(done)
 
 
 def largest_sigma(field: RadianceField, corners: np.ndarray, edge: float, per_axis: int) -> np.ndarray:
@@ -303,26 +327,3 @@ def largest_weights(octree: Octree, dataset: Dataset, background: Sequence[float
         batch = bank.batch(tiles, np.ones(len(tiles), dtype=np.float32))
         ops.train_step(octree, state, batch, options, still, bank.pixel_angle)
     return state.max_weight
-
-
-def compare(
-    octree: Octree,
-    dataset: Dataset,
-    background: Sequence[float],
-    render_field: Callable[[Camera], np.ndarray],
-    config: DistillConfig,
-) -> tuple[float, float]:
-    """Mean PSNR (dB) of the field and of the octree on the same evenly chosen views of the dataset."""
-    count = min(config.compare_views, len(dataset.cameras))
-    chosen = np.linspace(0, len(dataset.cameras) - 1, count).round().astype(int)
-    smaller = dataclasses.replace(
-        dataset, cameras=[dataset.cameras[i] for i in chosen], images=[dataset.images[i] for i in chosen],
-        names=[dataset.names[i] for i in chosen],
-    )  # fmt: skip
-    rows = []
-    for camera, image in zip(smaller.cameras, smaller.pyramid(background, config.compare_downscale), strict=True):
-        camera, truth = camera.scaled(config.compare_downscale), image.astype(np.float32) / 255
-        mine = render_image(octree, camera, background, 0.0, ("rgb",), 0.0)["rgb"]
-        rows.append([psnr(np.clip(np.asarray(picture), 0, 1), truth) for picture in (render_field(camera), mine)])
-    field_psnr, octree_psnr = np.mean(rows, axis=0)
-    return float(field_psnr), float(octree_psnr)

@@ -8,6 +8,7 @@ terms that empty space; RMSprop on touched vertices.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -19,7 +20,9 @@ from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
 from nerfvol.memory import splits_within
 from nerfvol.octree import Octree, Transfer, convert_rows
+from nerfvol.settings import filled
 from nerfvol.tiles import Cursor, TileBank
+from nerfvol.topology import MAX_LEVEL
 
 
 @dataclass
@@ -82,14 +85,28 @@ class OctreeConfig:
     early_stop_eps: float = 4e-3
     """Training rays end when their transmittance falls below."""
 
+    def __post_init__(self) -> None:
+        for name, (low, high) in RANGES.items():
+            given = getattr(self, name)
+            for value in given if isinstance(given, list) else [given]:
+                if value is not None and not low <= value <= high:
+                    raise InputError(f"octree.{name} must lie between {low:g} and {high:g}, got {value:g}")
+
     def for_scene(self, scene: SceneBounds) -> OctreeConfig:
         """The same with a number for each None; photographs are scenes with surroundings."""
-        automatic = BOUNDED if scene.background_cube is None else PHOTOGRAPHS
-        return dataclasses.replace(
-            self, **{name: value for name, value in automatic.items() if getattr(self, name) is None}
-        )
+        return filled(self, BOUNDED if scene.background_cube is None else PHOTOGRAPHS)
 
 
+RANGES = {
+    "steps": (1, math.inf), "levels": (1, MAX_LEVEL), "downscales": (1, 256), "until": (0, 1), "tiles": (1, 1 << 20),
+    "prunes": (0, math.inf), "coverage": (0, math.inf), "prune_steps": (0, math.inf), "sh_degree": (0, 3),
+    "final_sh_degree": (0, 3), "rich_share": (0, 1), "colour": (0, math.inf), "distortion": (0, math.inf),
+    "regulariser_decay": (1e-9, 1), "rate_density": (0, 1e3), "rate_dc": (0, 1e3), "rate_sh": (0, 1e3),
+    "rate_decay": (1e-9, 1), "decay_from": (0, 0.999), "beta": (0, 0.9999), "prune_weight": (0, math.inf),
+    "final_prune_weights": (0, 1), "final_prune_loss": (0, math.inf), "whole_pixels": (0, math.inf), "fine_from": (0, math.inf),
+    "subdivide_pixels": (0, math.inf), "subdivide_error": (0, 1), "fine_steps": (0, math.inf), "early_stop_eps": (0, 0.999),
+}  # fmt: skip
+"""Smallest and largest value of each setting, and of each entry of a list."""
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8}
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35}
 """Settings of an octree where nothing else is said."""
@@ -110,10 +127,6 @@ class OctreeTrainer:
         for name in ("downscales", "until", "tiles", "prunes"):
             if len(getattr(config, name)) != n:
                 raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
-        if not 0 <= config.final_sh_degree <= 3:
-            raise InputError(f"octree.final_sh_degree must be 0 to 3, got {config.final_sh_degree}")
-        if not 0 <= config.decay_from < 1:
-            raise InputError(f"octree.decay_from must lie in [0, 1), got {config.decay_from}")
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
         self.octree = octree if octree is not None else self._thin_start()
         self.state = ops.TrainState(self.octree)
@@ -129,8 +142,7 @@ class OctreeTrainer:
         """Bound on splitting, where memory is short; None: none."""
 
     def _thin_start(self) -> Octree:
-        cameras = np.stack([camera.position for camera in self.dataset.cameras])
-        return thin_octree(self.dataset.scene, self.config.levels[0], self.config.sh_degree, cameras)
+        return thin_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
 
     @property
     def _start(self) -> float:
@@ -324,13 +336,13 @@ def n_shells(scene: SceneBounds) -> int:
     return max(0, int(np.ceil(np.log2(around / detail) - 1e-6)))
 
 
-def thin_octree(scene: SceneBounds, level: int, sh_degree: int, cameras: np.ndarray) -> Octree:
+def thin_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
     """A nearly transparent octree: 2**level cells along the detail cube, then shells of doubling cells to the horizon.
 
     Each shell reaches twice as far as the one inside it with cells twice as large, so that cells look about equally
-    large from the middle. In scenes with surroundings the space close to ``cameras`` (n, 3) is left empty: what stands
-    right before one lens is seen by no other and would only explain that one picture.
+    large from the middle. Right before the lenses there is nothing (Dataset.before_a_lens).
     """
+    scene = dataset.scene
     lo, hi = scene.aabb
     detail, shells, n = float((hi - lo).max()), n_shells(scene), 2**level
     size = detail * 2**shells
@@ -343,13 +355,8 @@ def thin_octree(scene: SceneBounds, level: int, sh_degree: int, cameras: np.ndar
         levels.append(np.full(len(ijk), level + shells - shell))
         cells.append(ijk + (2 ** (level + shells - shell) - n) // 2)
     levels, cells = np.concatenate(levels), np.concatenate(cells)
-    if shells:
-        centers = origin + (cells + 0.5) * (size / 2.0**levels)[:, None]
-        near = 0.1 * np.median(np.linalg.norm(cameras - scene.center, axis=1))
-        far_enough = np.ones(len(levels), dtype=bool)
-        for camera in cameras:
-            far_enough &= ((centers - camera) ** 2).sum(1) > near**2
-        levels, cells = levels[far_enough], cells[far_enough]
+    kept = ~dataset.before_a_lens(origin + (cells + 0.5) * (size / 2.0**levels)[:, None])
+    levels, cells = levels[kept], cells[kept]
     return Octree.from_leaves(levels, cells, origin, size, sh_degree, density_scale=300 / detail)
 
 

@@ -43,6 +43,8 @@ FINISH_SECONDS_PER_LEAF = 1.5e-6
 """... writing and reading an octree in compact storage (two cores of 2023); a run that takes longer ends later."""
 HELD_OUT_KEPT = 32 << 20
 """Bytes of held-out images that a run keeps; more are read once again to be scored."""
+COMPARED_SIZE = 200
+"""Pixels along the middle of a held-out view on which field and octrees are compared: a field takes seconds for so many."""
 LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
 RUNNING = 0.98
@@ -123,9 +125,10 @@ class Run:
         self.phase_started, self.running = 0.0, math.nan
         self.interrupted = False
         loading = time.perf_counter()
-        self.held_out = some_views(load_dataset(config.data, "val", config.downscale), LARGEST_HELD_OUT)
-        self._few = some_views(self.held_out, config.compare_views)
-        self._first = some_views(self.held_out, 1)
+        self.held_out = load_dataset(config.data, "val", config.downscale).evenly(LARGEST_HELD_OUT)
+        self._first = self.held_out.evenly(1)
+        self.comparison_views = self.held_out.evenly(config.compare_views).middles(COMPARED_SIZE)
+        """Parts of held-out views on which field, distilled and fine-tuned octree are compared."""
         self._loading = 0.0
         if self.held_out.nbytes > HELD_OUT_KEPT:  # else let go until they are scored
             self.held_out.release()
@@ -134,11 +137,14 @@ class Run:
         for message in self.dataset.messages:
             print(message)
         require_something(self.dataset, config.background)
-        self.config = config = dataclasses.replace(config, octree=config.octree.for_scene(self.dataset.scene))
+        scene = self.dataset.scene
+        self.config = config = dataclasses.replace(
+            config, octree=config.octree.for_scene(scene), distill=config.distill.for_scene(scene)
+        )
         lens = self.dataset.cameras[0].intrinsics
         self._degree = max(config.octree.sh_degree, config.octree.final_sh_degree)
         share = rich_share(self.dataset, config.background)
-        held = self.held_out.nbytes or self._first.nbytes + self._few.nbytes  # views of it share its images
+        held = self.held_out.nbytes or self._first.nbytes + self.comparison_views.nbytes
         self._beside = Beside(share, held, field=config.init == "mlp")
         wanted = largest_octree(config.octree.levels, lens.width * lens.height)
         self.max_leaves = affordable_leaves(self.dataset, self._degree, least=min(wanted, 1 << 18), beside=self._beside)
@@ -276,10 +282,6 @@ class Run:
         print(f"saved at {place}; to go on: nerfvol train --resume --out {self.folder}", flush=True)
         return KeyboardInterrupt()
 
-    def comparison_views(self) -> Dataset:
-        """The held-out views on which field, distilled and fine-tuned octree are compared."""
-        return self._few
-
     def metadata(self) -> dict[str, Any]:
         """What the octree file says of itself; no clock and no machine in it, so that equal runs write equal files."""
         config = self.config
@@ -303,10 +305,10 @@ class Run:
         if phase is not None:
             phase.picture(self.held_out.cameras[0])
         rendering = 0.1e-6 * image.size / 3 if phase is None else time.perf_counter() - started
-        views = len(self.held_out) + (self.config.compare_views if self.stages else 0)
         writing = FINISH_SECONDS + FINISH_SECONDS_PER_LEAF * (1_000_000 if phase is None else phase.n_leaves)
         return min(
-            writing + self._loading + 1.1 * views * (scoring + rendering), RESERVE_SHARE * self.config.time_budget
+            writing + self._loading + 1.1 * len(self.held_out) * (scoring + rendering),
+            RESERVE_SHARE * self.config.time_budget,
         )
 
 
@@ -319,17 +321,6 @@ def require_something(dataset: Dataset, background: Sequence[float]) -> None:
             f"{dataset.source}: the training images are empty, nothing in them differs from the background {colour}; "
             "check the images, or choose another --background"
         )
-
-
-def some_views(dataset: Dataset, most: int) -> Dataset:
-    """At most ``most`` of the dataset's views, evenly chosen."""
-    if len(dataset) <= most:
-        return dataset
-    chosen = np.linspace(0, len(dataset) - 1, most).round().astype(int)
-    return dataclasses.replace(
-        dataset, cameras=[dataset.cameras[i] for i in chosen], images=[dataset.images[i] for i in chosen],
-        names=[dataset.names[i] for i in chosen],
-    )  # fmt: skip
 
 
 def decibels(squared_error: float) -> float:

@@ -7,9 +7,15 @@ reads the settings, few use a field.
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfvol.datasets import SceneBounds
+
+T = TypeVar("T")
 
 WHITE = (1.0, 1.0, 1.0)
 """The background where nobody says another, RGB in [0, 1]."""
@@ -127,8 +133,8 @@ class FieldConfig:
 class DistillConfig:
     """How a field is made into an octree."""
 
-    level: int = 8
-    """Finest leaves: 2**level along an edge of the detail cube."""
+    level: int | None = None
+    """Finest leaves: 2**level along an edge of the detail cube. None: 8, and 6 in photographs, whose fields are hazy."""
     coarse_level: int = 5
     """Where the search begins; also the coarsest leaves that merging makes in the detail cube."""
     sh_degree: int = 1
@@ -142,9 +148,19 @@ class DistillConfig:
     """Leaves whose largest rendering weight over the training rays is below are removed; 0 keeps all."""
     samples_per_vertex: int = 8
     """Field samples averaged into a vertex: 1 (the vertex itself) or 8."""
-    max_leaves: int = 4_000_000
-    """Most candidates; ``empty_opacity`` is raised until they fit."""
+    max_leaves: int = 2_000_000
+    """Most candidates; leaves are made coarser until they fit, then ``empty_opacity`` is raised."""
     visibility_downscale: int = 4
     compare_downscale: int = 4
-    compare_views: int = 4
+    compare_views: int = 2
     """Views, and their size, for the comparison of field and octree."""
+
+    def for_scene(self, scene: SceneBounds) -> DistillConfig:
+        """The same with a number for each None; photographs are scenes with surroundings."""
+        return filled(self, {"level": 8 if scene.background_cube is None else 6})
+
+
+def filled(settings: T, automatic: Mapping[str, Any]) -> T:
+    """The dataclass ``settings`` with a value of ``automatic`` for each of these that is None."""
+    chosen = {name: value for name, value in automatic.items() if getattr(settings, name) is None}
+    return dataclasses.replace(cast(Any, settings), **chosen)

@@ -9,7 +9,6 @@ import numpy as np
 
 from nerfvol.cameras import tile_pixels
 from nerfvol.datasets import Dataset
-from nerfvol.datasets.images import composite_average
 from nerfvol.kernels.ops import TILE, Batch
 from nerfvol.native import native
 
@@ -121,9 +120,8 @@ def _sort_out(tiles: np.ndarray, background: Sequence[float]) -> tuple[np.ndarra
 
 def rich_share(dataset: Dataset, background: Sequence[float], views: int = 4) -> float:
     """Share of tiles that are not plain, in a few of the dataset's views: how large a TileBank will be."""
-    chosen = np.linspace(0, len(dataset) - 1, min(views, len(dataset))).round().astype(int)
-    few = [_sort_out(_tiled(composite_average(dataset.images[i], background, 1)), background)[1] for i in chosen]
-    return float(np.mean(np.concatenate(few) > 0))
+    rows = dataset.evenly(views).pyramid(background, 1, lambda image: _sort_out(_tiled(image), background)[1])
+    return float(np.mean(np.concatenate(rows) > 0))
 
 
 def _next(tiles: np.ndarray, cursor: Cursor, count: int, seed: list[int]) -> np.ndarray:

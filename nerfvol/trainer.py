@@ -118,7 +118,7 @@ def distil_field(run: Run, phase: FieldPhase) -> Octree:
     written = save_octree(run.folder / runs.DISTILLED, octree, run.metadata(), config.storage)
     run.stages["distilled"] = {"seconds": time.perf_counter() - started, "leaves": octree.n_leaves,
                                "MB": written / 1e6, "lost_on_training_views_db": report.lost_db}  # fmt: skip
-    few = run.comparison_views()
+    few = run.comparison_views
     run.stages["field"] |= summary(score_views(phase.picture, few, background))
     run.stages["distilled"] |= summary(evaluate_octree(octree, few, background))
     return octree
@@ -134,7 +134,7 @@ def finish(run: Run, phase: OctreePhase) -> None:
     scores = evaluate_octree(stored, run.held_out, config.background)
     row = {"seconds": seconds, "steps": run.steps["octree"], "leaves": stored.n_leaves, "MB": written / 1e6}
     if run.stages:
-        run.stages["fine_tuned"] = row | summary(evaluate_octree(stored, run.comparison_views(), config.background))
+        run.stages["fine_tuned"] = row | summary(evaluate_octree(stored, run.comparison_views, config.background))
     lens = run.held_out.cameras[-1].intrinsics
     metrics = {
         **summary(scores), "n_images": len(scores["rows"]), "split": "val", "image_size": [lens.width, lens.height],
@@ -260,7 +260,10 @@ def summary(scores: dict[str, Any]) -> dict[str, Any]:
 def print_table(run: Run, metrics: dict[str, Any]) -> None:
     """What the run came to, in a few lines."""
     if run.stages:
-        print(f"\n{len(run.comparison_views())} held-out views   PSNR    SSIM   seconds     leaves      MB   s/frame")
+        few = run.comparison_views
+        lens = few.cameras[-1].intrinsics
+        views = f"middle {lens.width}x{lens.height} of {len(few)}"
+        print(f"\n{views:21s}PSNR    SSIM   seconds     leaves      MB   s/frame")
         for name, row in run.stages.items():
             leaves = "" if row["leaves"] is None else f"{row['leaves']:,}"
             print(f"{name.replace('_', '-'):18s} {row['psnr']:6.2f}  {row['ssim']:.4f} {row['seconds']:9.1f} "

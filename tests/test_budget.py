@@ -63,7 +63,7 @@ def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
     monkeypatch.setattr(session.time, "perf_counter", look)
     cli.set_threads(1)
     run = session.Run(settings(tiny_scene, tmp_path, time_budget=1000.0), session.Clock(0.0, 0.0), None)
-    assert "images" not in vars(run.held_out) and len(run.comparison_views()) == 2
+    assert "images" not in vars(run.held_out) and len(run.comparison_views) == 2
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0)
     writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 1_000_000
     octree = Pretended("octree")

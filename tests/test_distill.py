@@ -180,19 +180,59 @@ def test_neighbours_of_what_is_dense_are_candidates() -> None:
     assert len(ijk) == 4**3 and ijk.min() == 14 and ijk.max() == 17
 
 
-def test_a_hazy_field_keeps_its_densest_cells() -> None:
-    """Too many candidates: the threshold rises until they fit, which is said; the middle of the blob stays."""
-    frame, messages = Frame.of(DOMAIN, 5), []
-    config = DistillConfig(level=5, coarse_level=3, max_leaves=3000)
-    level, ijk = candidate_cells(Blob(), frame, config, messages)
-    assert 300 < len(ijk) <= 3000 and (level == 5).all()
-    assert len(messages) == 1 and "hazy" in messages[0]
-    everywhere = np.array(list(np.ndindex(32, 32, 32)))
-    found, wanted = (int((np.linalg.norm(cells + 0.5 - 16, axis=1) < 3).sum()) for cells in (ijk, everywhere))
-    assert found == wanted
+def test_a_hazy_field_has_coarser_leaves() -> None:
+    """Too many candidates: the leaves that fit hold all of the field, and it is said how fine they are."""
     unlimited: list[str] = []
-    assert len(candidate_cells(Blob(), frame, DistillConfig(level=5, coarse_level=3), unlimited)[0]) > 3000
-    assert not unlimited
+    candidates = [candidate_cells(Blob(), Frame.of(DOMAIN, level), DistillConfig(level=level, coarse_level=3), unlimited)
+                  for level in (5, 4, 3)]  # fmt: skip
+    fine, coarse, coarsest = (len(ijk) for _, ijk in candidates)
+    assert fine > 4 * coarse > 16 * coarsest > 0 and not unlimited
+    for most, which in [(2 * fine, 0), (fine - 1, 1), (coarse, 1), (coarse - 1, 2), (coarsest, 2)]:
+        messages: list[str] = []
+        config = DistillConfig(level=5, coarse_level=3, max_leaves=most)
+        found = candidate_cells(Blob(), Frame.of(DOMAIN, 5), config, messages)
+        assert all(np.array_equal(*pair) for pair in zip(found, candidates[which], strict=True)), most
+        if which:
+            assert len(messages) == 1 and f"1/{32 >> which} of the region" in messages[0] and "hazy" in messages[0]
+        else:
+            assert not messages
+
+
+def test_a_field_that_does_not_fit_keeps_its_densest_cells() -> None:
+    """Fewer leaves than the coarsest take: the threshold rises until they fit; the middle of the blob stays."""
+    messages: list[str] = []
+    level, ijk = candidate_cells(
+        Blob(), Frame.of(DOMAIN, 5), DistillConfig(level=5, coarse_level=3, max_leaves=100), messages
+    )
+    assert 8 <= len(ijk) <= 100 and (level == 3).all()
+    assert len(messages) == 2 and "only what is more opaque than" in messages[1] and "fits into 100 leaves" in messages[1]
+    middle = np.array(list(np.ndindex(2, 2, 2))) + 3
+    assert {tuple(cell) for cell in middle.tolist()} <= {tuple(cell) for cell in ijk.tolist()}
+
+
+def test_photographs_are_distilled_coarsely() -> None:
+    """Where nothing else is said: their fields are hazy."""
+    objects = views(Blob(), 1).scene
+    photographs = dataclasses.replace(objects, background_cube=8 * objects.aabb)
+    assert [DistillConfig().for_scene(scene).level for scene in (objects, photographs)] == [8, 6]
+    assert DistillConfig(level=7).for_scene(photographs).level == 7
+
+
+def test_nothing_is_left_before_a_lens() -> None:
+    """Of a field that is dense everywhere around photographs, what stands right before a camera goes."""
+
+    class Everywhere(Blob):
+        def density(self, positions: torch.Tensor) -> torch.Tensor:
+            return torch.full((len(positions),), 0.3)
+
+    dataset = views(Everywhere(), 3)
+    bounds = dataset.scene.aabb
+    middle = bounds.mean(0)
+    dataset.scene = dataclasses.replace(dataset.scene, background_cube=middle + 4 * (bounds - middle))
+    domain = dataclasses.replace(DOMAIN, outer=4.0)
+    config = DistillConfig(level=4, coarse_level=3, visibility_downscale=1, prune_weight=0.0, merge_tolerance=0.0)
+    octree, report = distill(Everywhere(), domain, dataset, (1, 1, 1), config)
+    assert report.leaves > 4**3 and not dataset.before_a_lens(octree.leaf_centers()).any()
 
 
 def test_cells_are_searched_throughout() -> None:
@@ -340,3 +380,13 @@ def test_empty_fields_are_an_error() -> None:
     hidden = dataclasses.replace(config, prune_weight=1.1)
     with pytest.raises(InputError, match="training views can see"):
         distill(Blob(), DOMAIN, away, (1, 1, 1), hidden)
+
+
+@pytest.mark.parametrize("samples", [1, 8])
+def test_values_do_not_depend_on_the_parts(monkeypatch, samples) -> None:
+    """Vertices are filled a part at a time, to spare memory; each alone. Sums are of float64 products either way."""
+    whole, parts = full_octree(3), full_octree(3)
+    write_values(whole, Blob(), samples)
+    monkeypatch.setattr("nerfvol.distill._CHUNK", 100)  # 729 vertices: the last part is shorter
+    write_values(parts, Blob(), samples)
+    np.testing.assert_allclose(parts.values, whole.values, rtol=1e-6, atol=1e-6)

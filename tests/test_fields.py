@@ -7,7 +7,17 @@ import torch
 
 from nerfvol import sh as spherical
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain, FieldShape, HashField, MLPField, RadianceField, make_field, truncated_exp
+from nerfvol.fields import (
+    ROWS,
+    Domain,
+    FieldShape,
+    HashField,
+    MLPField,
+    NeuralField,
+    RadianceField,
+    make_field,
+    truncated_exp,
+)
 
 DOMAIN = Domain((0.5, -1.0, 2.0), 1.5)
 SMALL = {"width": 16, "depth": 2, "hash_levels": 3, "hash_log2_table": 8, "hash_min": 4, "hash_max": 16}
@@ -140,3 +150,31 @@ def test_autocast_returns_full_precision_results() -> None:
     # bfloat16 keeps 8 bits: raw density of order 1 to a few times 2**-8.
     torch.testing.assert_close(sigma, exact[0], rtol=8 * 2**-8, atol=0)
     assert math.isclose(float(rgb.mean().detach()), float(exact[1].mean().detach()), abs_tol=0.02)
+
+
+@pytest.mark.parametrize("encoding", ["hash", "frequency"])
+@pytest.mark.parametrize("head", ["sh", "rgb"])
+def test_networks_see_whole_rows(encoding: str, head: str) -> None:
+    """Any number of points is filled up to a multiple of ROWS, which changes neither values nor gradients."""
+    field = make_field(DOMAIN, FieldShape(encoding=encoding, head=head, **SMALL), seed=1).double()
+    seen: list[int] = []
+    field.trunk.register_forward_hook(lambda module, inputs, output: seen.append(len(output)))
+    for n in (1, 50, ROWS, ROWS + 1):
+        positions, dirs = (rows.double() for rows in inputs(n))
+        for name in ("density", "forward") + (("sh",) if head == "sh" else ()):
+            arguments = (positions, dirs) if name == "forward" else (positions,)
+            gradients = []
+            for method in (getattr(NeuralField, name), getattr(NeuralField, name).__wrapped__):
+                seen.clear()
+                results = method(field, *arguments)
+                results = results if isinstance(results, tuple) else (results,)
+                if method is getattr(NeuralField, name):
+                    assert seen == [-(-n // ROWS) * ROWS]
+                assert {len(rows) for rows in results} == {n}
+                field.zero_grad()
+                sum(rows.sin().sum() for rows in results).backward()
+                gradients.append([rows.detach() for rows in results] + [
+                    p.grad.clone() for p in field.parameters() if p.grad is not None
+                ])  # fmt: skip
+            for padded, plain in zip(*gradients, strict=True):
+                torch.testing.assert_close(padded, plain, rtol=1e-9, atol=1e-9)

@@ -1,15 +1,17 @@
 """Coarse to fine: when leaves go and when they are split."""
 
 import dataclasses
+import weakref
 
 import numpy as np
 import pytest
 
 from nerfvol.datasets import load_dataset
 from nerfvol.errors import InputError
-from nerfvol.finetune import OctreeConfig, OctreeTrainer
-from nerfvol.octree import DENSITY_SLOT
+from nerfvol.finetune import RANGES, OctreeConfig, OctreeTrainer
+from nerfvol.octree import DENSITY_SLOT, Octree
 from nerfvol.render import render_image
+from nerfvol.topology import MAX_LEVEL
 
 
 def test_nothing_is_pruned_before_it_could_become_visible(tiny_scene):
@@ -68,6 +70,22 @@ def test_the_last_pruning_leaves_what_pictures_miss(tiny_scene):
     assert tuner.finish() is tuner.octree
 
 
+def test_the_last_pruning_stands_beside_nothing_else(tiny_scene, monkeypatch):
+    """Two octrees are in memory while they are compared: moments, statistics and tiles are let go before."""
+    tuner, _ = finished_trainer(tiny_scene, 0.03)
+    held = [weakref.ref(part) for part in (tuner.state, tuner.state.moments, tuner.bank, tuner.bank.pixels[0])]
+    alive = []
+
+    def prune(octree, keep):
+        alive.append([part() is not None for part in held])
+        return pruned(octree, keep)
+
+    pruned = Octree.prune
+    monkeypatch.setattr(Octree, "prune", prune)
+    tuner.finish()
+    assert alive and not np.any(alive)
+
+
 def test_the_last_pruning_needs_to_have_seen_enough(tiny_scene):
     """Right after a pruning nothing is known of what rays need."""
     tuner, _ = finished_trainer(tiny_scene, 0.03)
@@ -106,13 +124,28 @@ def test_the_last_stage_has_more_bands(tiny_scene):
 @pytest.mark.parametrize(
     "setting, expected",
     [
-        ({"final_sh_degree": 4}, "final_sh_degree must be 0 to 3, got 4"),
-        ({"decay_from": 1.0}, r"decay_from must lie in \[0, 1\)"),
+        ("sh_degree=7", "sh_degree must lie between 0 and 3, got 7"),
+        ("sh_degree=-1", "sh_degree must lie between 0 and 3, got -1"),
+        ("final_sh_degree=4", "final_sh_degree must lie between 0 and 3, got 4"),
+        ("rate_decay=0", "rate_decay must lie between 1e-09 and 1, got 0"),
+        ("decay_from=1.0", "decay_from must lie between 0 and 0.999, got 1"),
+        ("levels=[5, 40]", f"levels must lie between 1 and {MAX_LEVEL}, got 40"),
+        ("tiles=[0]", "tiles must lie between 1 and 1.04858e+06, got 0"),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(tiny_scene, setting, expected):
-    with pytest.raises(InputError, match=f"octree.{expected}"):
-        OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), OctreeConfig(**setting), 0, None)
+def test_settings_that_mean_nothing_are_refused(tiny_scene, tmp_path, command, setting, expected):
+    code, _, err = command("train", "--data", tiny_scene, "--out", tmp_path / "run", "--set", f"octree.{setting}")
+    assert code == 2 and err.strip().endswith(f"octree.{expected}") and len(err.strip().splitlines()) == 1
+
+
+def test_every_number_has_a_range():
+    """A setting that is added without one would go unchecked."""
+    assert set(RANGES) == {f.name for f in dataclasses.fields(OctreeConfig)}
+
+
+def test_stages_need_settings_each(tiny_scene):
+    with pytest.raises(InputError, match=r"octree.tiles must have one entry per stage \(7\), got 1"):
+        OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), OctreeConfig(tiles=[8]), 0, None)
 
 
 def test_photographs_have_settings_of_their_own(tiny_scene):

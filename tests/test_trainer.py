@@ -13,7 +13,6 @@ from tiny_runs import TINY, Pretended, log_of, settings, start
 
 from nerfvol import runs, session, trainer
 from nerfvol.checkpoint import load_checkpoint, save_checkpoint
-from nerfvol.datasets import load_dataset
 from nerfvol.errors import InputError
 
 
@@ -129,14 +128,13 @@ def test_the_running_error_follows_slowly(tmp_path, tiny_scene):
         assert run.running == pytest.approx(running)
 
 
-def test_a_run_scores_itself_on_views_from_all_around(tiny_scene):
-    dataset = load_dataset(tiny_scene, "train")
-    few = session.some_views(dataset, 3)
-    assert few.names == [dataset.names[i] for i in (0, 6, 11)]
-    for name, image, camera in zip(few.names, few.images, few.cameras, strict=True):
-        i = dataset.names.index(name)
-        assert image is dataset.images[i] and camera is dataset.cameras[i]
-    assert session.some_views(dataset, 12) is dataset
+def test_fields_and_octrees_are_compared_on_parts_of_views(tmp_path, tiny_scene, monkeypatch):
+    """A field renders slowly."""
+    for most, size in [(200, 40), (40, 40), (13, 13)]:
+        monkeypatch.setattr(session, "COMPARED_SIZE", most)
+        run = session.Run(settings(tiny_scene, tmp_path, compare_views=1), session.Clock(0.0, 0.0), None)
+        (camera,), (image,) = run.comparison_views.cameras, run.comparison_views.images
+        assert image.shape[:2] == (size, size) and camera.intrinsics.width == size
 
 
 # ---------------------------------------------------------------- a real scene

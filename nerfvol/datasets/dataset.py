@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from nerfvol.cameras import Camera
 from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads
 from nerfvol.errors import InputError
+
+NEAR_SHARE = 0.1
+"""Of the median distance between cameras and the scene's middle: what counts as right before a lens."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +91,42 @@ class Dataset:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         self.images = reload()
         return self.images
+
+    def evenly(self, most: int) -> Dataset:
+        """At most ``most`` of the views, evenly chosen, the first and the last among them; the same images."""
+        if len(self) <= most:
+            return self
+        chosen = np.linspace(0, len(self) - 1, most).round().astype(int)
+        cameras, images, names = ([column[i] for i in chosen] for column in (self.cameras, self.images, self.names))
+        return replace(self, cameras=cameras, images=images, names=names)
+
+    def smaller(self, k: int, background: Sequence[float]) -> Dataset:
+        """All views area-averaged over k x k pixels, over a background (3,) in [0, 1]."""
+        cameras = [camera.scaled(k) for camera in self.cameras]
+        return replace(self, cameras=cameras, images=self.pyramid(background, k))
+
+    def middles(self, size: int) -> Dataset:
+        """The middle of all views, at most size x size pixels of each; the images' memory is shared."""
+        cameras, images = [], []
+        for camera, image in zip(self.cameras, self.images, strict=True):
+            top, left = (max(0, (full - size) // 2) for full in image.shape[:2])
+            part = image[top : top + size, left : left + size]
+            lens = camera.intrinsics.cropped(left, top, part.shape[1], part.shape[0])
+            cameras.append(replace(camera, intrinsics=lens))
+            images.append(part)
+        return replace(self, cameras=cameras, images=images)
+
+    def before_a_lens(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points (n, 3) are right before a camera, (n,): what is there is seen by no other and would only explain
+        that one picture. None in scenes without surroundings, whose cameras stand outside."""
+        hidden = np.zeros(len(points), dtype=bool)
+        if self.scene.background_cube is None:
+            return hidden
+        cameras = np.stack([camera.position for camera in self.cameras])
+        near = NEAR_SHARE * np.median(np.linalg.norm(cameras - self.scene.center, axis=1))
+        for camera in cameras:
+            hidden |= ((points - camera) ** 2).sum(1) <= near**2
+        return hidden
 
     def composited(self, i: int, background: Sequence[float]) -> NDArray[np.float32]:
         """Image i over a background (3,) in [0, 1]: float32 (h, w, 3) in [0, 1]."""

@@ -1,0 +1,69 @@
+"""What can be asked of posed images: a few of them, smaller ones, what stands right before a lens."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nerfvol.datasets import load_dataset
+from nerfvol.datasets.dataset import NEAR_SHARE, SceneBounds
+from nerfvol.errors import InputError
+
+
+def test_a_few_views_come_from_all_around(tiny_scene):
+    dataset = load_dataset(tiny_scene, "train")
+    few = dataset.evenly(3)
+    assert few.names == [dataset.names[i] for i in (0, 6, 11)]
+    for name, image, camera in zip(few.names, few.images, few.cameras, strict=True):
+        i = dataset.names.index(name)
+        assert image is dataset.images[i] and camera is dataset.cameras[i]
+    assert dataset.evenly(12) is dataset
+    assert dataset.evenly(1).names == dataset.names[:1]
+
+
+def test_smaller_views_are_the_pyramids(tiny_scene):
+    dataset, background = load_dataset(tiny_scene, "train"), (0.2, 0.5, 0.9)
+    small = dataset.smaller(4, background)
+    assert small.names == dataset.names and small.scene is dataset.scene
+    for image, expected in zip(small.images, dataset.pyramid(background, 4), strict=True):
+        assert np.array_equal(image, expected)
+    for camera, original in zip(small.cameras, dataset.cameras, strict=True):
+        assert camera.intrinsics == original.intrinsics.scaled(4)
+        np.testing.assert_allclose(camera.c2w, original.c2w, rtol=0, atol=1e-12)  # made orthonormal once more
+    with pytest.raises(InputError, match="the downscale factor must be a positive integer, got 0"):
+        dataset.smaller(0, background)
+
+
+@pytest.mark.parametrize("size, left", [(100, 0), (40, 0), (13, 13)])
+def test_the_middle_of_views(tiny_scene, size, left):
+    """Pixels and the rays that belong to them."""
+    dataset = load_dataset(tiny_scene, "train")
+    part, n = dataset.middles(size), min(size, 40)
+    inside = slice(left, left + n)
+    for camera, image, whole, original in zip(part.cameras, part.images, dataset.cameras, dataset.images, strict=True):
+        assert np.array_equal(image, original[inside, inside]) and np.shares_memory(image, original)
+        directions, expected = camera.intrinsics.directions(), whole.intrinsics.directions()[inside, inside]
+        np.testing.assert_allclose(directions, expected, rtol=0, atol=2e-7)
+        np.testing.assert_allclose(camera.c2w, whole.c2w, rtol=0, atol=1e-12)
+
+
+def test_a_part_must_lie_in_the_picture(tiny_scene):
+    lens = load_dataset(tiny_scene, "train").cameras[0].intrinsics
+    for place in [(-1, 0, 10, 10), (0, -1, 10, 10), (31, 0, 10, 10), (0, 31, 10, 10)]:
+        with pytest.raises(InputError, match="no part of a 40x40 image"):
+            lens.cropped(*place)
+
+
+def test_what_stands_before_a_lens(tiny_scene):
+    """Photographs only: a tenth of the median distance to the scene's middle, around each camera."""
+    dataset = load_dataset(tiny_scene, "train")
+    positions = np.stack([camera.position for camera in dataset.cameras])
+    distances = np.linalg.norm(positions - dataset.scene.center, axis=1)
+    outwards = (positions - dataset.scene.center) / distances[:, None]
+    radius = NEAR_SHARE * np.median(distances)
+    inside, outside = (positions + factor * radius * outwards for factor in (0.99, 1.01))
+    points = np.concatenate([positions, inside, outside])
+    assert not dataset.before_a_lens(points).any()
+    surroundings = SceneBounds(dataset.scene.aabb, 8 * dataset.scene.aabb, has_alpha=False)
+    hidden = dataclasses.replace(dataset, scene=surroundings).before_a_lens(points)
+    assert hidden.tolist() == [True] * 24 + [False] * 12
