@@ -112,6 +112,8 @@ PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35}
 """Settings of an octree where nothing else is said."""
 
 
+WORTH_PRUNING = 0.05
+"""Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
 FINAL_TILES = 4096
 """Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
 
@@ -258,8 +260,16 @@ class OctreeTrainer:
             and progress >= start + due * (c.until[self.stage] - start)
             and self._seen_enough()
         ):
-            self.prune()
+            if (self.state.max_weight < self.config.prune_weight).mean() < WORTH_PRUNING:
+                self._start_anew()
+            else:
+                self.prune()
             self.prunings += 1
+
+    def _start_anew(self) -> None:
+        """Forgets what rays needed so far."""
+        self.tiles_seen = 0
+        self.state.reset_statistics(self.octree.n_leaves)
 
     def prune(self) -> tuple[np.ndarray, np.ndarray]:
         """Removes leaves that no ray needed; error and footprint of those that stay."""

@@ -16,22 +16,21 @@ from nerfvol.errors import InputError
 from nerfvol.machine import available_memory
 from nerfvol.octree import BLOCKS
 
-BASE_BYTES = 400 << 20
+BASE_BYTES = 110 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
-lego's 5-minute run has at its peak (1.12 to 1.22 GiB) beside the arrays named below."""
-FIELD_BYTES = 320 << 20
-"""torch, the code that it compiles and what the training of a field and its distillation leave behind: measured."""
+runs have at their peak beside the arrays named below."""
+FIELD_BYTES = 310 << 20
+"""torch, the code that it compiles and what the training of a field leaves behind: measured."""
+DISTILL_BYTES = 290 << 20
+"""Beside the field and the images: an octree of candidates before and after leaves were merged (0.9 million for lego)."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
 """Per vertex: a slot (int32), beside two rows of floats."""
 VERTICES_PER_LEAF = 1.65
 """Vertices of an octree that was split where it pays, for each leaf: measured on lego, 1.5 to 1.7 at every size."""
-CHANGE_BYTES_PER_LEAF = 59 - 24 + 11 + 84
-"""Per leaf while the largest octree is pruned and most of it stays: the new leaves (59, not yet their statistics
-and slots: 24 with the vertices'), what describes the change (parent 4, octant 1, source and place of 1.32 vertices 5 each)
-and the new rows of values (64 a vertex), where 1.32 vertices stay for each leaf that was; the second moments follow when
-the old values are gone. A split needs less: the octree before it is a fraction of the one after it."""
+BEFORE_SHARE = 0.4
+"""Of the leaves of the largest octree: those that the octree before it had, which is in memory while its leaves are split."""
 RICH_BYTES_PER_PIXEL = 3
 """Per training pixel in a tile that is not plain background: 8-bit RGB."""
 TILE_BYTES_PER_PIXEL = 0.33
@@ -60,32 +59,51 @@ class Beside:
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes by use; ``leaves`` is the largest number of leaves that was reckoned with."""
+    """Bytes by use; ``leaves`` is the largest number of leaves that was reckoned with.
+
+    Images, octree and change are there at one time, the distillation of a field (0: there is none) at another.
+    """
 
     base: int
     images: int
     octree: int
     change: int
     leaves: int
+    distillation: int = 0
 
     @property
     def peak(self) -> int:
         """Everything at its largest."""
-        return self.base + self.images + self.octree + self.change
+        return self.base + max(self.images + self.octree + self.change, self.distillation)
 
     def sentence(self) -> str:
         """The parts in words."""
+        before = f", before that {gib(self.distillation)} to distil the field" if self.distillation else ""
         return (
             f"{gib(self.peak)} at its peak: images {gib(self.images)}, an octree of up to {self.leaves:,} leaves "
-            f"{gib(self.octree)}, changing it {gib(self.change)}, the program {gib(self.base)}"
+            f"{gib(self.octree)}, changing it {gib(self.change)}, the program {gib(self.base)}{before}"
         )
 
 
 def octree_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> int:
     """Bytes of an octree under training, with its second moments and statistics; ``vertices`` None: VERTICES_PER_LEAF."""
-    rows = 2 * 4 * 16 * BLOCKS[sh_degree]
     count = VERTICES_PER_LEAF * leaves if vertices is None else vertices
-    return int(LEAF_BYTES * leaves + (VERTEX_BYTES + rows) * count)
+    return int(LEAF_BYTES * leaves + (VERTEX_BYTES + 2 * row_bytes(sh_degree)) * count)
+
+
+def change_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> int:
+    """Bytes beside an octree that has just been split into so many leaves, while the second moments follow the values.
+
+    Of the octree before: second moments and corners; and where each leaf and vertex came from, 5 bytes each. Pruning the
+    largest octree would take a quarter more, but it has few leaves to lose, and then it is not done (finetune.WORTH_PRUNING).
+    """
+    count = VERTICES_PER_LEAF * leaves if vertices is None else vertices
+    return int(BEFORE_SHARE * (row_bytes(sh_degree) * count + 32 * leaves) + 5 * (leaves + count))
+
+
+def row_bytes(sh_degree: int) -> int:
+    """Bytes of one row of values or second moments."""
+    return 4 * 16 * BLOCKS[sh_degree]
 
 
 def estimate_training(
@@ -93,21 +111,22 @@ def estimate_training(
 ) -> MemoryEstimate:
     """What training an octree of at most ``leaves`` leaves on ``dataset`` takes.
 
-    ``vertices`` None: VERTICES_PER_LEAF. The octree is largest when the training images stand in tiles and their files'
-    pixels were let go; these count where they are more than what the octree still has to grow by, or cannot be let go.
+    ``vertices`` None: VERTICES_PER_LEAF, and an octree that is largest when the training images stand in tiles and their
+    files' pixels were let go; these count where they are more than what the octree still has to grow by, or cannot be let go.
+    With ``vertices`` the octree is there, and so are the images that it has beside it now.
     """
     beside = beside or Beside()
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
-    octree = octree_bytes(leaves, sh_degree, vertices)
-    growth = 0 if dataset.reload is None else CHANGE_BYTES_PER_LEAF * leaves + octree // 2
+    octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
+    growth = 0 if dataset.reload is None or vertices is not None else change + octree // 2
+    tiles = int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
     return MemoryEstimate(
         base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
-        images=int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
-        + beside.held_out_bytes
-        + max(0, dataset.nbytes - growth),
+        images=tiles + beside.held_out_bytes + max(0, dataset.nbytes - growth),
         octree=octree,
-        change=CHANGE_BYTES_PER_LEAF * leaves,
+        change=change,
         leaves=leaves,
+        distillation=dataset.nbytes + beside.held_out_bytes + DISTILL_BYTES if beside.field else 0,
     )
 
 

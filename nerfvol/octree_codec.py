@@ -104,10 +104,9 @@ def decode(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(channel, range(n_channels)))
-    sh = np.empty((n_vertices, 3, basis_dim), np.float32)
-    for k in range(basis_dim):
-        sh[:, :, k] = rotated[k::basis_dim].T @ _TO_GREY
-    return density, sh
+    for k in range(basis_dim):  # in place: this is most of the memory that loading takes
+        rotated[k::basis_dim] = (rotated[k::basis_dim].T @ _TO_GREY).T
+    return density, rotated.reshape(3, basis_dim, n_vertices).transpose(2, 0, 1)
 
 
 def plane_name(index: int, plane: str) -> str:

@@ -26,7 +26,7 @@ from nerfvol.evaluate import evaluate_octree, score_views
 from nerfvol.files import write_json
 from nerfvol.finetune import OctreeTrainer
 from nerfvol.kernels import ops
-from nerfvol.machine import describe_hardware, peak_memory, return_free_memory
+from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
 from nerfvol.octree import Octree
 from nerfvol.octree_io import load_octree, save_octree
 from nerfvol.render import render_image
@@ -47,6 +47,7 @@ def train(config: Config, started: float | None = None) -> Path:
         InputError: data that cannot be used, too little memory, a full disk, a scene that collapses to empty space.
         KeyboardInterrupt: Ctrl-C, after the step was finished and a checkpoint written.
     """
+    keep_large_arrays_apart()
     out = Path(config.out)
     saved = read_saved(out / runs.CHECKPOINT) if config.resume else None
     if saved is not None and saved["phase"] == "done":

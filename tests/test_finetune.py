@@ -167,3 +167,18 @@ def test_a_run_has_the_settings_of_its_scene(tiny_scene):
     for images, degree in [(dataset, 1), (photographs, 2)]:
         trainer = OctreeTrainer(images, (1, 1, 1), config, 0, None)
         assert trainer.octree.sh_degree == degree
+
+
+@pytest.mark.parametrize("share, prunes", [(0.04, False), (0.06, True)])
+def test_a_pruning_that_takes_little_is_left_out(tiny_scene, share, prunes):
+    """Two octrees would stand in memory for nothing; what rays need is noted anew all the same."""
+    config = OctreeConfig(levels=[4], downscales=[2], until=[1.0], tiles=[16], prunes=[1], prune_steps=8)
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    for _ in range(30):
+        tuner.step(0.0)
+    octree, n = tuner.octree, tuner.octree.n_leaves
+    tuner.state.max_weight[:] = np.where(np.arange(n) < share * n, 0.0, 1.0)
+    tuner.step(0.9)
+    assert tuner.prunings == 1 and tuner.tiles_seen == 16 and tuner.state.max_weight.max() < 1
+    assert (tuner.octree is not octree) == prunes
+    assert tuner.octree.n_leaves == (n - np.ceil(share * n) if prunes else n)

@@ -6,6 +6,7 @@
 // The order of every sum is fixed by the batch, so the result is the same to the last bit for any number of threads.
 #pragma once
 #include <algorithm>
+#include <deque>
 #include <memory>
 #include <mutex>
 
@@ -18,14 +19,38 @@ using nerfvol::kBuckets;
 using nerfvol::LeafStatistics;
 using nerfvol::Optimizer;
 
-// What phase 1 leaves of one packet. Kept between steps to spare the allocations.
-struct PacketRecord {
-    struct Row {
-        int32_t vertex, at;
+// Memory that is taken piece by piece and given back all at once: what one thread's packets leave to phase 2. Kept between
+// steps, it is as large as the largest step was; had each packet memory of its own, that would be as large as its largest.
+class Arena {
+public:
+    template <class T> T* take(size_t n) {
+        const size_t bytes = (n * sizeof(T) + 63) & ~size_t(63);
+        while (block_ < blocks_.size() && used_ + bytes > blocks_[block_].size) { ++block_; used_ = 0; }
+        if (block_ == blocks_.size()) blocks_.emplace_back(std::max(bytes, kBlock));
+        used_ += bytes;
+        return reinterpret_cast<T*>(blocks_[block_].bytes.get() + used_ - bytes);
+    }
+    void clear() { block_ = used_ = 0; }
+
+private:
+    static constexpr size_t kBlock = size_t(4) << 20;
+    struct Block {
+        explicit Block(size_t n) : bytes(new (std::align_val_t{64}) char[n]), size(n) {}
+        struct Free {
+            void operator()(char* p) const { ::operator delete[](p, std::align_val_t{64}); }
+        };
+        std::unique_ptr<char[], Free> bytes;
+        size_t size;
     };
-    VertexGradients gradients;
-    std::vector<Row> order;               // of the gradients' rows: by bucket, and as they were met within each
-    std::vector<Visit> visits;            // by the bucket of the leaf's first corner
+    std::vector<Block> blocks_;
+    size_t block_ = 0, used_ = 0;  // where the next piece begins
+};
+
+// What phase 1 leaves of one packet, in an arena.
+struct PacketRecord {
+    const int32_t* vertices;              // of the rows of gradients: by bucket, and as they were met within each
+    const float* rows;
+    const Visit* visits;                  // by the bucket of the leaf's first corner
     int32_t first_row[kBuckets + 1], first_visit[kBuckets + 1];
     StepReport report;
 };
@@ -46,26 +71,32 @@ template <class BucketOf, class Place> void sort_by_bucket(size_t n, int32_t* fi
     for (size_t i = 0; i < n; ++i) place(i, size_t(at[bucket_of(i)]++));
 }
 
-inline void group_by_bucket(const Tree& tree, int shift, const Workspace& work, bool with_visits, PacketRecord& rec) {
-    const std::vector<int32_t>& vertices = rec.gradients.vertices;
-    rec.order.resize(vertices.size());
-    sort_by_bucket(vertices.size(), rec.first_row, [&](size_t i) { return vertices[i] >> shift; },
-                   [&](size_t i, size_t to) { rec.order[to] = {vertices[i], int32_t(i)}; });
-    const std::vector<Visit>& visits = work.visits;
-    rec.visits.resize(with_visits ? visits.size() : 0);
-    sort_by_bucket(rec.visits.size(), rec.first_visit, [&](size_t i) { return tree.corners[8 * int64_t(visits[i].leaf)] >> shift; },
-                   [&](size_t i, size_t to) { rec.visits[to] = visits[i]; });
+template <int B>
+void group_by_bucket(const Tree& tree, int shift, const VertexGradients& gradients, const std::vector<Visit>& visits, Arena& arena,
+                     PacketRecord& rec) {
+    const std::vector<int32_t>& met = gradients.vertices;
+    int32_t* vertices = arena.take<int32_t>(met.size());
+    float* rows = arena.take<float>(16 * B * met.size());
+    sort_by_bucket(met.size(), rec.first_row, [&](size_t i) { return met[i] >> shift; }, [&](size_t i, size_t to) {
+        vertices[to] = met[i];
+        for (int k = 0; k < B; ++k) store(rows + 16 * (B * to + k), load<f16>(gradients.row(i) + 16 * k));
+    });
+    Visit* by_bucket = arena.take<Visit>(visits.size());
+    sort_by_bucket(visits.size(), rec.first_visit, [&](size_t i) { return tree.corners[8 * int64_t(visits[i].leaf)] >> shift; },
+                   [&](size_t i, size_t to) { by_bucket[to] = visits[i]; });
+    rec.vertices = vertices;
+    rec.rows = rows;
+    rec.visits = by_bucket;
 }
 
 // Adds a packet's gradients of the vertices in one bucket to the bucket's sums; slots has the place of each vertex there.
 template <int B> void add_rows(const PacketRecord& rec, int bucket, int32_t* slots, VertexGradients& sums) {
     for (int32_t i = rec.first_row[bucket]; i < rec.first_row[bucket + 1]; ++i) {
-        const PacketRecord::Row& entry = rec.order[size_t(i)];
-        const float* row = rec.gradients.row(size_t(entry.at));
-        int32_t& slot = slots[entry.vertex];
+        const float* row = rec.rows + 16 * B * size_t(i);
+        int32_t& slot = slots[rec.vertices[i]];
         if (slot < 0) {
             slot = int32_t(sums.vertices.size());
-            float* sum = sums.append(entry.vertex);
+            float* sum = sums.append(rec.vertices[i]);
             for (int k = 0; k < B; ++k) store(sum + 16 * k, load<f16>(row + 16 * k));
         } else {
             float* sum = sums.row(size_t(slot));
@@ -74,12 +105,11 @@ template <int B> void add_rows(const PacketRecord& rec, int bucket, int32_t* slo
     }
 }
 
-// Asks for what add_rows will read; the order of the rows was asked for before.
-inline void prefetch_rows(const PacketRecord& rec, int bucket, const int32_t* slots) {
+// Asks for what add_rows will read; the rows' vertices were asked for before.
+template <int B> void prefetch_rows(const PacketRecord& rec, int bucket, const int32_t* slots) {
     for (int32_t i = rec.first_row[bucket]; i < rec.first_row[bucket + 1]; ++i) {
-        const PacketRecord::Row& entry = rec.order[size_t(i)];
-        __builtin_prefetch(rec.gradients.row(size_t(entry.at)));
-        __builtin_prefetch(slots + entry.vertex, 1);
+        for (int k = 0; k < B; ++k) __builtin_prefetch(rec.rows + 16 * (B * size_t(i) + size_t(k)));
+        __builtin_prefetch(slots + rec.vertices[i], 1);
     }
 }
 
@@ -146,12 +176,20 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
     }
     static std::mutex one_call;
     const std::lock_guard<std::mutex> lock(one_call);
-    static std::vector<std::unique_ptr<PacketRecord>> records;
-    while (records.size() < packets.size()) records.emplace_back(new PacketRecord);
+    static std::deque<Arena> arenas;  // of the threads
+    static std::mutex growing;
+    for (Arena& arena : arenas) arena.clear();
+    const auto arena_of = [](int thread) -> Arena& {
+        const std::lock_guard<std::mutex> lock(growing);
+        while (arenas.size() <= size_t(thread)) arenas.emplace_back();
+        return arenas[size_t(thread)];
+    };
+    static std::vector<PacketRecord> records;
+    records.resize(packets.size());
     const int n = int(packets.size()), shift = bucket_shift(tree.n_vertices);
 
-    nerfvol::parallel_for(n, [&](int i, int) {
-        PacketRecord& rec = *records[size_t(i)];
+    nerfvol::parallel_for(n, [&](int i, int thread) {
+        PacketRecord& rec = records[size_t(i)];
         const int64_t first = packets[size_t(i)].first;
         const int count = packets[size_t(i)].second;
         Packet<1> p;
@@ -174,8 +212,11 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
         else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
         static thread_local VertexTable table;
-        backward_packet<B>(tree, basis, work, adjoint, table, rec.gradients);
-        group_by_bucket(tree, shift, work, statistics.max_weight != nullptr, rec);
+        static thread_local VertexGradients of_packet;
+        VertexGradients& gradients = of_packet;
+        backward_packet<B>(tree, basis, work, adjoint, table, gradients);
+        if (!statistics.max_weight) work.visits.clear();
+        group_by_bucket<B>(tree, shift, gradients, work.visits, arena_of(thread), rec);
     });
 
     nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
@@ -183,9 +224,9 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
         VertexGradients& sums = per_thread;
         sums.start(size_t(1) << shift, 16 * B);
         for (int i = 0; i < n; ++i) {
-            const PacketRecord& rec = *records[size_t(i)];
-            if (i + 2 < n) __builtin_prefetch(records[size_t(i + 2)]->order.data() + records[size_t(i + 2)]->first_row[bucket]);
-            if (i + 1 < n) prefetch_rows(*records[size_t(i + 1)], bucket, sink.slots);
+            const PacketRecord& rec = records[size_t(i)];
+            if (i + 2 < n) __builtin_prefetch(records[size_t(i + 2)].vertices + records[size_t(i + 2)].first_row[bucket]);
+            if (i + 1 < n) prefetch_rows<B>(records[size_t(i + 1)], bucket, sink.slots);
             add_rows<B>(rec, bucket, sink.slots, sums);
             for (int32_t k = rec.first_visit[bucket]; k < rec.first_visit[bucket + 1]; ++k)
                 add_statistics(rec.visits[size_t(k)], statistics, pixel_angle);
@@ -195,9 +236,9 @@ StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions
 
     StepReport total{0, 0, 0};
     for (int i = 0; i < n; ++i) {
-        total.squared_error += records[size_t(i)]->report.squared_error;
-        total.weight += records[size_t(i)]->report.weight;
-        total.samples += records[size_t(i)]->report.samples;
+        total.squared_error += records[size_t(i)].report.squared_error;
+        total.weight += records[size_t(i)].report.weight;
+        total.samples += records[size_t(i)].report.samples;
     }
     return total;
 }
