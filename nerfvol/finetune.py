@@ -31,6 +31,8 @@ class OctreeConfig:
 
     steps: int = 15000
     """Optimiser steps of the whole schedule when no time budget is given."""
+    most_steps: int = 45000
+    """... and when one is given, at most: a run that comes to them ends early, for more would overfit (docs/performance.md)."""
     levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
     """Finest level of each stage: level 8 means 256 cells along the region of detail."""
     downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1, 1])
@@ -98,7 +100,8 @@ class OctreeConfig:
 
 
 RANGES = {
-    "steps": (1, math.inf), "levels": (1, MAX_LEVEL), "downscales": (1, 256), "until": (0, 1), "tiles": (1, 1 << 20),
+    "steps": (1, math.inf), "most_steps": (1, math.inf), "levels": (1, MAX_LEVEL), "downscales": (1, 256),
+    "until": (0, 1), "tiles": (1, 1 << 20),
     "prunes": (0, math.inf), "coverage": (0, math.inf), "prune_steps": (0, math.inf), "sh_degree": (0, 3),
     "final_sh_degree": (0, 3), "rich_share": (0, 1), "colour": (0, math.inf), "distortion": (0, math.inf),
     "regulariser_decay": (1e-9, 1), "rate_density": (0, 1e3), "rate_dc": (0, 1e3), "rate_sh": (0, 1e3),
@@ -260,11 +263,22 @@ class OctreeTrainer:
             and progress >= start + due * (c.until[self.stage] - start)
             and self._seen_enough()
         ):
-            if (self.state.max_weight < self.config.prune_weight).mean() < WORTH_PRUNING:
+            if 1 - self._needed(self.config.prune_weight).mean() < WORTH_PRUNING:
                 self._start_anew()
             else:
                 self.prune()
             self.prunings += 1
+
+    def _needed(self, weight: float) -> np.ndarray:
+        """Which leaves have a largest weight of at least ``weight``, (n_leaves,).
+
+        And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what stands at the
+        rim of a few pictures would be lost for good. They cost no time, and are split no more.
+        """
+        needed = self.state.max_weight >= weight
+        if self.bank is not None and self.config.rich_share * self.tiles_seen < 2 * len(self.bank.rich_tiles):
+            needed |= self.state.footprint == 0
+        return needed
 
     def _start_anew(self) -> None:
         """Forgets what rays needed so far."""
@@ -273,8 +287,8 @@ class OctreeTrainer:
 
     def prune(self) -> tuple[np.ndarray, np.ndarray]:
         """Removes leaves that no ray needed; error and footprint of those that stay."""
+        keep = self._needed(self.config.prune_weight)
         self.tiles_seen = 0
-        keep = self.state.max_weight >= self.config.prune_weight
         if not keep.any():
             raise InputError(
                 f"the octree collapsed to empty space at step {self.step_count}: no training ray needs any of it; check "
@@ -296,12 +310,12 @@ class OctreeTrainer:
         tiles = self.bank.rich_tiles if len(self.bank.rich_tiles) else self.bank.plain_tiles
         tiles = rng.choice(tiles, min(len(tiles), FINAL_TILES), replace=False)
         batch = self.bank.batch(tiles, np.ones(len(tiles), np.float32))
-        max_weight, self.bank = self.state.max_weight, None
+        needed = [self._needed(weight) for weight in self.config.final_prune_weights]
+        self.bank = None
         del self.state, tiles
         return_free_memory()
         most = self._squared_error(self.octree, batch) * (1 + self.config.final_prune_loss)
-        for weight in self.config.final_prune_weights:
-            keep = max_weight >= weight
+        for keep in needed:
             if not keep.any():
                 continue
             pruned = None  # one at a time

@@ -62,6 +62,7 @@ class Phase(Protocol):
 
     name: str
     steps: int
+    most_steps: float
     preview_width: int
     trainer: Any
 
@@ -183,7 +184,7 @@ class Run:
             return phase.steps_done / phase.steps
         left = budget - self._reserve - self.phase_started
         share = min(self.config.field.time_budget, FIELD_SHARE * left) if phase.name == "field" else left
-        return self.phase_seconds() / share if share > 0 else 1.0
+        return max(self.phase_seconds() / share, phase.steps_done / phase.most_steps) if share > 0 else 1.0
 
     def follow(self, phase: Phase, error: float) -> None:
         """Keep the running error; a number that is none ends the run before it reaches a checkpoint."""

@@ -11,6 +11,7 @@ Ctrl-C, under a temporary name: kill -9 costs at most that interval.
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -159,6 +160,7 @@ class FieldPhase:
     previews = (0.1, 0.4, 1.0)
     preview_width = 100  # a field renders slowly
     stages_left = n_leaves = n_vertices = 0
+    most_steps = math.inf
 
     def __init__(self, run: Run) -> None:
         from nerfvol.train_field import FieldTrainer
@@ -202,7 +204,7 @@ class OctreePhase:
 
     def __init__(self, run: Run, octree: Octree | None) -> None:
         config = run.config
-        self.background, self.steps = config.background, config.octree.steps
+        self.background, self.steps, self.most_steps = config.background, config.octree.steps, config.octree.most_steps
         self.trainer = OctreeTrainer(run.dataset, config.background, config.octree, config.seed, octree)
         self.trainer.max_leaves = run.max_leaves
 

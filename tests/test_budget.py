@@ -44,6 +44,17 @@ def test_shares_of_a_budget(tmp_path, tiny_scene, monkeypatch):
         assert run.progress(Pretended("octree")) == pytest.approx(3.5 / 70)
 
 
+def test_a_budget_ends_early_where_more_steps_would_overfit(tmp_path, tiny_scene, monkeypatch):
+    """Progress is the share of the time or of the most steps, whichever is further."""
+    monkeypatch.setattr(session.Run, "_time_to_finish", lambda self, phase=None: 0.0)
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 30.0)
+    run = session.Run(settings(tiny_scene, tmp_path, time_budget=100.0), session.Clock(0.0, 0.0), None)
+    octree = Pretended("octree")
+    for steps, progress in [(0, 0.3), (299, 0.3), (500, 0.5), (1000, 1.0)]:
+        octree.steps_done = steps
+        assert run.progress(octree) == pytest.approx(progress)
+
+
 def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
     """By a clock that goes on a second at every look, with a picture that takes 10 more, on one thread.
 

@@ -182,3 +182,31 @@ def test_a_pruning_that_takes_little_is_left_out(tiny_scene, share, prunes):
     assert tuner.prunings == 1 and tuner.tiles_seen == 16 and tuner.state.max_weight.max() < 1
     assert (tuner.octree is not octree) == prunes
     assert tuner.octree.n_leaves == (n - np.ceil(share * n) if prunes else n)
+
+
+def test_what_no_ray_has_met_yet_is_kept(tiny_scene):
+    """Until every tile was drawn for certain: what stands at the rim of a few pictures would be lost for good."""
+    config = OctreeConfig(levels=[4], downscales=[2], until=[1.0], tiles=[16], prunes=[1], prune_steps=8)
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    for _ in range(10):
+        tuner.step(0.0)
+    third = np.arange(tuner.octree.n_leaves) % 3
+    tuner.state.max_weight[:] = np.where(third == 0, 0.5, 0.001)
+    tuner.state.footprint[:] = np.where(third == 2, 0.0, 1.0)  # not met
+    epoch = len(tuner.bank.rich_tiles)
+    for seen, kept in [(0, third != 1), (2 * epoch, third != 1), (2.5 * epoch, third == 0)]:  # four fifths are rich
+        tuner.tiles_seen = int(seen)
+        assert np.array_equal(tuner._needed(0.005), kept)
+    centers = tuner.octree.leaf_centers()
+    tuner.tiles_seen = 2 * epoch
+    tuner.prune()
+    assert np.array_equal(tuner.octree.query(centers) >= 0, third != 1) and tuner.tiles_seen == 0
+
+
+def test_the_last_pruning_keeps_what_no_ray_has_met_yet(tiny_scene):
+    tuner, needed = finished_trainer(tiny_scene, 0.03)
+    tuner.state.footprint[~needed] = 0.0
+    tuner.tiles_seen = tuner.config.prune_steps * 16
+    centers = tuner.octree.leaf_centers()
+    assert tuner.config.rich_share * tuner.tiles_seen < 2 * len(tuner.bank.rich_tiles)
+    assert (tuner.finish().query(centers) >= 0).all()

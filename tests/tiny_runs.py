@@ -53,3 +53,5 @@ class Pretended:
 
     name: str
     n_leaves: int = 0
+    steps_done: int = 0
+    most_steps: float = 1000.0
