@@ -31,8 +31,9 @@ class OctreeConfig:
 
     steps: int = 15000
     """Optimiser steps of the whole schedule when no time budget is given."""
-    most_steps: int = 45000
-    """... and when one is given, at most: a run that comes to them ends early, for more would overfit (docs/performance.md)."""
+    most_epochs: float = 40.0
+    """... and when one is given, as many as draw each tile so often at most: a run that comes to them ends early, for more
+    would overfit (docs/performance.md)."""
     levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
     """Finest level of each stage: level 8 means 256 cells along the region of detail."""
     downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1, 1])
@@ -100,7 +101,7 @@ class OctreeConfig:
 
 
 RANGES = {
-    "steps": (1, math.inf), "most_steps": (1, math.inf), "levels": (1, MAX_LEVEL), "downscales": (1, 256),
+    "steps": (1, math.inf), "most_epochs": (0.1, math.inf), "levels": (1, MAX_LEVEL), "downscales": (1, 256),
     "until": (0, 1), "tiles": (1, 1 << 20),
     "prunes": (0, math.inf), "coverage": (0, math.inf), "prune_steps": (0, math.inf), "sh_degree": (0, 3),
     "final_sh_degree": (0, 3), "rich_share": (0, 1), "colour": (0, math.inf), "distortion": (0, math.inf),

@@ -145,6 +145,9 @@ class Run:
         lens = self.dataset.cameras[0].intrinsics
         self._degree = max(config.octree.sh_degree, config.octree.final_sh_degree)
         share = rich_share(self.dataset, config.background)
+        pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in self.dataset.cameras)
+        self.rich_tiles = max(share, 0.01) * pixels / ops.TILE
+        """About so many training tiles are not plain background."""
         held = self.held_out.nbytes or self._first.nbytes + self.comparison_views.nbytes
         self._beside = Beside(share, held, field=config.init == "mlp")
         wanted = largest_octree(config.octree.levels, lens.width * lens.height)

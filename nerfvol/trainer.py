@@ -33,6 +33,8 @@ from nerfvol.octree_io import load_octree, save_octree
 from nerfvol.render import render_image
 from nerfvol.session import Clock, Run, read_saved
 
+FEWEST_STEPS = 5000
+"""Of the octree, before a run with a time budget may end early, however few its tiles."""
 LOG_EVERY = 50
 """Steps between two lines of the log."""
 
@@ -204,7 +206,9 @@ class OctreePhase:
 
     def __init__(self, run: Run, octree: Octree | None) -> None:
         config = run.config
-        self.background, self.steps, self.most_steps = config.background, config.octree.steps, config.octree.most_steps
+        self.background, self.steps = config.background, config.octree.steps
+        drawn = config.octree.rich_share * config.octree.tiles[-1] if config.octree.rich_share else config.octree.tiles[-1]
+        self.most_steps = max(FEWEST_STEPS, config.octree.most_epochs * run.rich_tiles / drawn)
         self.trainer = OctreeTrainer(run.dataset, config.background, config.octree, config.seed, octree)
         self.trainer.max_leaves = run.max_leaves
 

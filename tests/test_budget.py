@@ -7,9 +7,10 @@ import time
 import pytest
 from tiny_runs import TINY, Pretended, log_of, settings, start
 
-from nerfvol import cli, runs, session
+from nerfvol import cli, runs, session, trainer
 from nerfvol.memory import estimate_training, octree_bytes
 from nerfvol.octree_io import load_octree
+from nerfvol.trainer import OctreePhase
 
 
 @pytest.mark.parametrize("init", ["direct", "mlp"])
@@ -110,7 +111,7 @@ def test_memory_is_announced_anew_where_the_octree_outgrows_the_estimate(tmp_pat
 def test_a_budget_is_kept(tmp_path, tiny_scene):
     """On the real clock; a step of this scene takes milliseconds."""
     config = settings(tiny_scene, tmp_path, time_budget=3.0, checkpoint_every=1000)
-    config.octree.steps = 10**9
+    config.octree.steps = config.octree.most_epochs = 10**9
     started = time.perf_counter()
     start(config, started=started)
     log = log_of(tmp_path)
@@ -127,3 +128,13 @@ def test_the_time_of_earlier_sessions_counts(tmp_path, tiny_scene):
     clock = session.Clock(time.perf_counter() - 2, 30.0)
     assert clock.elapsed() == pytest.approx(32, abs=0.5)
     assert 0 < session.Clock(None, 0.0).elapsed() < 3600
+
+
+def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
+    """12 pictures of 25 tiles, of which those that show the sphere count."""
+    run = session.Run(settings(tiny_scene, tmp_path, time_budget=100.0), session.Clock(0.0, 0.0), None)
+    assert run.rich_tiles == pytest.approx(300 * run._beside.rich_share) and 100 < run.rich_tiles <= 300
+    drawn = run.config.octree.tiles[-1] * run.config.octree.rich_share
+    for epochs, steps in [(1e4, 1e4 * run.rich_tiles / drawn), (1.0, trainer.FEWEST_STEPS)]:
+        run.config.octree.most_epochs = epochs
+        assert OctreePhase(run, None).most_steps == pytest.approx(steps)

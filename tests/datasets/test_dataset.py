@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerfvol.datasets import load_dataset
+from nerfvol.datasets import Dataset, load_dataset
 from nerfvol.datasets.dataset import NEAR_SHARE, SceneBounds
 from nerfvol.errors import InputError
+from tests.datasets.scenes import random_images, ring
 
 
 def test_a_few_views_come_from_all_around(tiny_scene):
@@ -34,15 +35,18 @@ def test_smaller_views_are_the_pyramids(tiny_scene):
         dataset.smaller(0, background)
 
 
-@pytest.mark.parametrize("size, left", [(100, 0), (40, 0), (13, 13)])
-def test_the_middle_of_views(tiny_scene, size, left):
-    """Pixels and the rays that belong to them."""
-    dataset = load_dataset(tiny_scene, "train")
-    part, n = dataset.middles(size), min(size, 40)
-    inside = slice(left, left + n)
+@pytest.mark.parametrize(
+    "size, rows, columns",
+    [(100, slice(0, 16), slice(0, 24)), (20, slice(0, 16), slice(2, 22)), (9, slice(3, 12), slice(7, 16))],
+)
+def test_the_middle_of_views(size, rows, columns):
+    """Pixels and the rays that belong to them, of pictures of 24x16 pixels."""
+    bounds = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, has_alpha=False)
+    dataset = Dataset(ring(3), random_images(3), ["a", "b", "c"], bounds, "test")
+    part = dataset.middles(size)
     for camera, image, whole, original in zip(part.cameras, part.images, dataset.cameras, dataset.images, strict=True):
-        assert np.array_equal(image, original[inside, inside]) and np.shares_memory(image, original)
-        directions, expected = camera.intrinsics.directions(), whole.intrinsics.directions()[inside, inside]
+        assert np.array_equal(image, original[rows, columns]) and np.shares_memory(image, original)
+        directions, expected = camera.intrinsics.directions(), whole.intrinsics.directions()[rows, columns]
         np.testing.assert_allclose(directions, expected, rtol=0, atol=2e-7)
         np.testing.assert_allclose(camera.c2w, whole.c2w, rtol=0, atol=1e-12)
 
