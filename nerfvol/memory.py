@@ -16,7 +16,7 @@ from nerfvol.errors import InputError
 from nerfvol.machine import available_memory
 from nerfvol.octree import BLOCKS
 
-BASE_BYTES = 110 << 20
+BASE_BYTES = 160 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
 runs have at their peak beside the arrays named below."""
 FIELD_BYTES = 310 << 20
