@@ -385,8 +385,8 @@ def test_empty_fields_are_an_error() -> None:
 @pytest.mark.parametrize("samples", [1, 8])
 def test_values_do_not_depend_on_the_parts(monkeypatch, samples) -> None:
     """Vertices are filled a part at a time, to spare memory; each alone. Sums are of float64 products either way."""
-    whole, parts = full_octree(3), full_octree(3)
+    whole, parts = (full_octree(3).subdivide(np.arange(512) % 3 == 0)[0] for _ in range(2))
     write_values(whole, Blob(), samples)
-    monkeypatch.setattr("nerfvol.distill._CHUNK", 100)  # 729 vertices: the last part is shorter
+    monkeypatch.setattr("nerfvol.distill._CHUNK", 100)  # of the vertices of two sizes of leaves; the last part is shorter
     write_values(parts, Blob(), samples)
     np.testing.assert_allclose(parts.values, whole.values, rtol=1e-6, atol=1e-6)
