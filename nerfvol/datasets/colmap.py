@@ -1,4 +1,4 @@
-"""COLMAP models: cameras and images, binary or text, as written by COLMAP into ``sparse/0``.
+"""COLMAP models: cameras, images and points, binary or text, as written by COLMAP into ``sparse/0``.
 
 Poses are world-to-camera in OpenCV axes (x right, y down, z forward), a unit quaternion (w, x, y, z) and a translation;
 the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
@@ -6,8 +6,9 @@ the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
 
 from __future__ import annotations
 
+import itertools
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,9 @@ _MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
     "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
 }
 _NAMES = {number: name for name, (number, _) in _MODELS.items()}
+_MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
+_AROUND = 1.25  # a lens's distortion may move a point by so much from where a pinhole would show it
+_FITTING = 0.9  # of the observations, the fewest that lie inside their images; all do where poses and points belong together
 
 
 def find_model(folder: Path) -> Path | None:
@@ -53,12 +57,13 @@ def read_colmap(folder: Path, split: str) -> Listing:
     source = model / ("images.bin" if binary else "images.txt")
     calibrations = _binary_cameras(model / "cameras.bin") if binary else _text_cameras(model / "cameras.txt")
     finder = ImageFinder(image_folder(folder))
-    frames = []
-    for name, quaternion, translation, camera in _binary_images(source) if binary else _text_images(source):
+    frames, numbers = [], []
+    for number, name, quaternion, translation, camera in _binary_images(source) if binary else _text_images(source):
         if camera not in calibrations:
             raise InputError(f"{source}, image {name}: its camera {camera} is not in the model's cameras")
         try:
             frames.append(Frame(name, finder.find(name), _pose(quaternion, translation), calibrations[camera]))
+            numbers.append(number)
         except InputError as error:
             raise InputError(f"{source}, image {name}: {error}") from None
     if not frames:
@@ -68,7 +73,39 @@ def read_colmap(folder: Path, split: str) -> Listing:
     if not present:
         return Listing(frames, frames, source)
     chosen, training, sentence = hold_out(present, split)
-    return Listing(chosen + missing, training, source, messages=[sentence])
+    doubt = _doubt(model, dict(zip(numbers, frames, strict=True)))
+    return Listing(chosen + missing, training, source, messages=[sentence, *doubt])
+
+
+def _doubt(model: Path, frames: dict[int, Frame]) -> list[str]:
+    """A sentence where the model's points lie outside the images that it says show them; ``frames`` by image number."""
+    binary = model / "points3D.bin"
+    path = binary if binary.is_file() else model / "points3D.txt"
+    if not path.is_file() or any(frame.calibration.fisheye for frame in frames.values()):
+        return []
+    shown: dict[int, list[tuple[float, ...]]] = {}
+    points = _binary_points(path) if path == binary else _text_points(path)
+    for place, track in itertools.islice(points, _MOST_POINTS):
+        for number in track:
+            shown.setdefault(number, []).append(place)
+    inside = total = 0
+    for number, places in shown.items():
+        if number not in frames:
+            continue
+        frame = frames[number]
+        lens, (width, height) = frame.calibration, (frame.calibration.width or 0, frame.calibration.height or 0)
+        right, up, back = ((np.array(places) - frame.c2w[:3, 3]) @ frame.c2w[:3, :3]).T
+        # Distances from the middle of the image, in pixels, times -back: nothing behind a camera is within a negative bound.
+        x = np.abs((lens.fx or 0) * right - ((lens.cx or 0) - width / 2) * back)
+        y = np.abs((lens.fy or 0) * -up - ((lens.cy or 0) - height / 2) * back)
+        inside += int(((x <= -back * _AROUND * width / 2) & (y <= -back * _AROUND * height / 2)).sum())
+        total += len(places)
+    if not total or inside >= _FITTING * total:
+        return []
+    return [
+        f"{path}: only {100 * inside / total:.0f} % of what its tracks list lies inside the images, by the model's poses: "
+        "these are not the poses of the photographs, so expect no picture of them; run COLMAP again"
+    ]
 
 
 def _pose(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -171,7 +208,8 @@ def _checked(path: Path, camera: int, model: str, width: int, height: int, param
         raise InputError(f"{path}, camera {camera}: {error}") from None
 
 
-_Image = tuple[str, NDArray[np.float64], NDArray[np.float64], int]
+_Image = tuple[int, str, NDArray[np.float64], NDArray[np.float64], int]  # number, name, quaternion, translation, camera
+_Point = tuple[tuple[float, ...], Sequence[int]]  # place, numbers of the images that show it
 
 
 def _binary_images(path: Path) -> Iterator[_Image]:
@@ -182,7 +220,7 @@ def _binary_images(path: Path) -> Iterator[_Image]:
         observations = 24 * cursor.take("Q")[0]  # (x, y, point id) of every feature
         cursor.require(observations)
         cursor.at += observations
-        yield name, np.array(values[1:5]), np.array(values[5:8]), values[8]
+        yield values[0], name, np.array(values[1:5]), np.array(values[5:8]), values[8]
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
@@ -190,13 +228,31 @@ def _text_images(path: Path) -> Iterator[_Image]:
         if not line:
             continue
         try:
-            _, *numbers, camera, name = line.split(maxsplit=9)
+            number, *numbers, camera, name = line.split(maxsplit=9)
             values = [float(v) for v in numbers]
             if len(values) != 7:
                 raise ValueError
-            yield name, np.array(values[:4]), np.array(values[4:]), int(camera)
+            yield int(number), name, np.array(values[:4]), np.array(values[4:]), int(camera)
         except ValueError:
             fields = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            raise InputError(f"{path}: expected {fields}, got {line!r:.60}") from None
+
+
+def _binary_points(path: Path) -> Iterator[_Point]:
+    cursor = _Cursor(path)
+    for _ in range(cursor.take("Q")[0]):
+        _, x, y, z, *_, length = cursor.take("Q3d3BdQ")
+        cursor.require(8 * length)
+        yield (x, y, z), cursor.take(f"{2 * length}i")[::2]
+
+
+def _text_points(path: Path) -> Iterator[_Point]:
+    for line in filter(None, _lines(path)):
+        try:
+            _, x, y, z, _, _, _, _, *track = line.split()
+            yield (float(x), float(y), float(z)), list(map(int, track[::2]))
+        except ValueError:
+            fields = "POINT3D_ID X Y Z R G B ERROR TRACK"
             raise InputError(f"{path}: expected {fields}, got {line!r:.60}") from None
 
 

@@ -92,6 +92,40 @@ def test_missing_photographs_of_a_model_are_left_out(tmp_path):
     assert any("lists 1 images that are not on disk" in message for message in dataset.messages)
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_poses_that_do_not_fit_the_points_of_the_model_are_doubted(tmp_path, text):
+    """Poses of other photographs: half of the cameras look away from what their images are said to show, or stand so that
+    it lies beside them. Where they look at it nothing is said, also right at the edge of their images."""
+    cameras = scenes.ring()
+    k = cameras[0].intrinsics
+    edge = 0.5 * min(k.width / k.fx, k.height / k.fy) * 4.0  # at the ring's middle, 4 away
+    places = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3)) * edge
+    scenes.write_colmap(tmp_path, cameras, scenes.random_images(), text=text, model="PINHOLE")
+    assert len(load_dataset(tmp_path).messages) == 2
+    scenes.write_points(tmp_path, cameras, places, text=text)
+    assert len(load_dataset(tmp_path).messages) == 2
+    for away in (np.diag([-1.0, 1, -1, 1]), np.diag([1.0, -1, -1, 1])):
+        turned = [replace(c, c2w=c.c2w @ away) if i % 9 < 5 else c for i, c in enumerate(cameras)]
+        scenes.write_colmap(tmp_path, turned, scenes.random_images(), text=text, model="PINHOLE")
+        assert any("only 44 % of what its tracks list lies inside" in m for m in load_dataset(tmp_path).messages)
+    for axis, distance in ((0, 2.5), (0, -2.5), (1, 1.9), (1, -1.9)):  # images are half as wide again as they are high
+        aside = [replace(c, c2w=c.c2w + np.outer(distance * edge * c.c2w[:, axis], [0, 0, 0, 1.0])) for c in cameras]
+        scenes.write_colmap(tmp_path, aside, scenes.random_images(), text=text, model="PINHOLE")
+        assert any("these are not the poses of the photographs" in m for m in load_dataset(tmp_path).messages)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_damaged_points_are_refused(tmp_path, text):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), text=text)
+    scenes.write_points(tmp_path, scenes.ring(), np.zeros((3, 3)), text=text)
+    path = tmp_path / "sparse" / "0" / ("points3D.txt" if text else "points3D.bin")
+    edit(path, (lambda d: d.replace(b" 0.5 ", b" half ")) if text else (lambda d: d[:-7]))
+    if text:
+        edit(path, lambda d: d.replace(b"0.0 0.0 0.0", b"0.0 here 0.0", 1))
+    with pytest.raises(InputError, match="expected POINT3D_ID" if text else "truncated"):
+        load_dataset(tmp_path)
+
+
 def edit(path, change):
     path.write_bytes(change(path.read_bytes()))
 
