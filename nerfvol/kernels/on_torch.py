@@ -110,7 +110,8 @@ def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOpt
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
         tree = ops.kernel_tree(octree, values.detach().contiguous().numpy())
-        loss = (bg, eps, float(options.colour), float(options.distortion), 1.0)
+        smooth = (float(options.smooth_density), float(options.smooth_colour))
+        loss = (bg, eps, float(options.colour), float(options.distortion), *smooth, 1.0)
         no_optimiser = (None, None, [0.0, 0.0, 0.0], 0.0, 0.0)
         no_statistics = (None, None, None)
         compiled.train_step(

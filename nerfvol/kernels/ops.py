@@ -261,6 +261,8 @@ def train_step(
         eps,
         float(options.colour),
         float(options.distortion),
+        float(options.smooth_density),
+        float(options.smooth_colour),
         float(pixel_angle),
         None,
         octree.values,

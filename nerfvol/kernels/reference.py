@@ -178,11 +178,33 @@ def distortion(weights: Tensor, middle: Tensor, length: Tensor, ray: Tensor, n_r
     return torch.stack(out)
 
 
+_EDGES = torch.tensor([(o ^ axis, o) for axis in (1, 2, 4) for o in range(8) if o & axis])
+_KNEE_DENSITY, _KNEE_COLOUR = 1.0, 0.1
+
+
+def roughness(octree: Octree, values: Tensor, leaf: Tensor) -> tuple[Tensor, Tensor]:
+    """Differences between neighbouring corners of the leaves (n,), raw density and colour: both (n,).
+
+    Sums over the 12 edges (and all SH coefficients) of |d| - e log(1 + |d| / e): a total variation [Plenoxels] that counts
+    differences below e = 1 (density) and 0.1 (coefficients) by their squares, larger ones as they are.
+    """
+    rows = values[torch.from_numpy(octree.corners).long()[leaf]]
+    d = (rows[:, _EDGES[:, 1]] - rows[:, _EDGES[:, 0]]).abs()
+    density = d[..., DENSITY_SLOT]
+    colour = d[..., torch.from_numpy(sh_slots(octree.sh_degree)).flatten()]
+    return (
+        (density - _KNEE_DENSITY * torch.log1p(density / _KNEE_DENSITY)).sum(1),
+        (colour - _KNEE_COLOUR * torch.log1p(colour / _KNEE_COLOUR)).sum((1, 2)),
+    )
+
+
 def loss(octree: Octree, values: Tensor, rays_o, rays_d, target, weight, options) -> tuple[Tensor, dict]:
     """The training loss of a batch (see ops.LossOptions) and the squared error per ray.
 
     sum_rays weight * ( |C - target|^2 + colour * (sum_i w_i |c_i - target|^2 + T |background - target|^2)
-                        + distortion * L_distortion ), distances of the last term in root cubes.
+                        + distortion * L_distortion
+                        + sum_i length_i / side_i (smooth_density * roughness of density + smooth_colour * of colour) ),
+    distances of the distortion in root cubes; the last sum goes over the leaves that the ray crosses.
     """
     n = len(rays_o)
     background = torch.tensor(options.background, dtype=values.dtype)
@@ -198,5 +220,10 @@ def loss(octree: Octree, values: Tensor, rays_o, rays_d, target, weight, options
         length = (s.segments.t_far - s.segments.t_near) / octree.size
         spread = distortion(s.weights, s.middle / octree.size, length, ray, n)
         total = total + options.distortion * spread
+    if options.smooth_density > 0 or options.smooth_colour > 0:
+        density, colour = roughness(octree, values, s.segments.leaf)
+        side = torch.from_numpy(octree.leaf_sizes()).to(values.dtype)[s.segments.leaf]
+        sides = (s.segments.t_far - s.segments.t_near) / side
+        total = total + _per_ray(n, ray, sides * (options.smooth_density * density + options.smooth_colour * colour))
     report = {"squared_error": squared.detach(), "samples": s}
     return (weight * total).sum(), report

@@ -61,11 +61,13 @@ class Batch:
 
 @dataclass(frozen=True)
 class LossOptions:
-    """See reference.loss for the formula."""
+    """Weights of the loss's terms: see reference.loss for the formula."""
 
     background: Sequence[float] = WHITE
     colour: float = 0.0
     distortion: float = 0.0
+    smooth_density: float = 0.0
+    smooth_colour: float = 0.0
     early_stop_eps: float = DEFAULT_EARLY_STOP
 
 

@@ -71,6 +71,7 @@ class Trace:
     ghost_ray: np.ndarray
     ghost_leaf: np.ndarray
     ghost_tau: np.ndarray
+    ghost_length: np.ndarray
 
 
 def _slabs(octree: Octree, o: np.ndarray, d: np.ndarray, leaf: np.ndarray):
@@ -96,13 +97,14 @@ def _slabs(octree: Octree, o: np.ndarray, d: np.ndarray, leaf: np.ndarray):
 
 
 def _ghosts(octree: Octree, o: np.ndarray, d: np.ndarray):
-    """Pairs of rays and leaves whose meeting is a matter of rounding, and the largest optical depth it could have."""
+    """Pairs of rays and leaves whose meeting is a matter of rounding, the largest optical depth and length it could have."""
     ray, leaf = np.repeat(np.arange(len(o)), octree.n_leaves), np.tile(np.arange(octree.n_leaves), len(o))
     near, far, d_near, d_far, *_ = _slabs(octree, o[ray], d[ray], leaf)
     error = d_near + d_far
     unsure = (np.abs(far - near) <= error) & (error > 0)
     densest = explin(octree.density.astype(np.float64))[octree.corners].max(1) * octree.density_scale
-    return ray[unsure], leaf[unsure], 2 * error[unsure] * octree.size * densest[leaf[unsure]]
+    length = 2 * error[unsure] * octree.size
+    return ray[unsure], leaf[unsure], length * densest[leaf[unsure]], length
 
 
 def trace(octree: Octree, rays_o: np.ndarray, rays_d: np.ndarray, early_stop_eps: float = 0.0) -> Trace:
@@ -151,13 +153,13 @@ def trace(octree: Octree, rays_o: np.ndarray, rays_d: np.ndarray, early_stop_eps
     behind, total = running(d_tau + 6 * U)
     before = np.exp(-depth)
     d_before = before * np.minimum(behind, 1)
-    ghost_ray, ghost_leaf, ghost_tau = _ghosts(octree, o, d)
+    ghost_ray, ghost_leaf, ghost_tau, ghost_length = _ghosts(octree, o, d)
     ghost = np.bincount(ghost_ray, ghost_tau, n_rays)
     return Trace(
         ray, leaf, near * size, far * size, middle * size, s.weights.numpy(), before, before * np.exp(-tau), tau,
         tau_slope, raw, colour, np.where(OFFSETS == 1, place[:, None], 1 - place[:, None]).prod(-1), basis, hits,
         d_near * size, d_length * size, d_middle * size, d_place, d_raw, d_colour, d_tau, d_tau_slope, d_before,
-        np.minimum(total + ghost, 1), ghost, ghost_ray, ghost_leaf, ghost_tau,
+        np.minimum(total + ghost, 1), ghost, ghost_ray, ghost_leaf, ghost_tau, ghost_length,
     )  # fmt: skip
 
 
@@ -231,6 +233,28 @@ def output_gradient_bounds(t: Trace, octree: Octree, background, g_rgb, g_trans,
     np.maximum.at(q, t.ray, share)
     np.maximum.at(d_q, t.ray, d_share)
     return gradient_bounds(t, octree, g, q, 4 * U * g, d_q)
+
+
+def roughness_bounds(t: Trace, octree: Octree, weight: np.ndarray, density: float, colour: float) -> np.ndarray:
+    """What the gradient of the roughness adds to :func:`gradient_bounds`: (n_vertices, row). weight: of the rays (n,).
+
+    A corner has three edges; the slope d / (e + |d|) of each is below 1 and off by 5 u (a difference, a sum, a quotient, a
+    product), the way through the leaf by its own error and a ghost's whole length; and the rows are summed in any order.
+    """
+    side = octree.leaf_sizes()
+    row = np.full(octree.values.shape[1], colour)
+    row[DENSITY_SLOT] = density
+    terms = np.zeros(octree.n_vertices)
+    np.add.at(terms, octree.corners[t.leaf].ravel(), 1)
+    out = np.zeros(octree.values.shape)
+    for o in range(8):
+        vertex = octree.corners[t.leaf, o]
+        order = U * (np.minimum(terms[vertex], 4096) + t.hits[t.ray] + 24)
+        off = (t.d_length + (t.far - t.near) * order) / side[t.leaf]
+        np.add.at(out, vertex, 3 * (weight[t.ray] * off)[:, None] * row)
+    ghosts = 3 * weight[t.ghost_ray] * t.ghost_length / side[t.ghost_leaf]
+    np.add.at(out, octree.corners[t.ghost_leaf], (ghosts[:, None] * row)[:, None])
+    return out
 
 
 def gradient_bounds(

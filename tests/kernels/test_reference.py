@@ -76,19 +76,45 @@ def test_gradcheck_of_the_images(degree):
     )
 
 
-@pytest.mark.parametrize("colour, distortion", [(0.0, 0.0), (0.4, 0.0), (0.0, 0.7)])
-def test_gradcheck_of_the_loss(colour, distortion):
+@pytest.mark.parametrize(
+    "terms",
+    [{}, {"colour": 0.4}, {"distortion": 0.7}, {"smooth_density": 0.3}, {"smooth_colour": 0.3}],
+    ids=lambda terms: next(iter(terms), "plain"),
+)
+def test_gradcheck_of_the_loss(terms):
     rng = np.random.default_rng(8)
     octree = random_octree("full", 0, rng)
     octree = octree.prune(np.arange(octree.n_leaves) % 5 == 0)[0]
     octree.density = rng.uniform(-1.0, 2.5, octree.n_vertices)
     o, d = rays64(*scattered_rays(octree, rng, 4))
-    options = ops.LossOptions(colour=colour, distortion=distortion, early_stop_eps=0.0)
+    options = ops.LossOptions(**terms, early_stop_eps=0.0)
     target, weight = torch.rand(4, 3, dtype=torch.float64), torch.rand(4, dtype=torch.float64)
     values = torch.from_numpy(octree.values).double().requires_grad_()
     assert torch.autograd.gradcheck(
         lambda v: reference.loss(octree, v, o, d, target, weight, options)[0], (values,), eps=1e-6, atol=1e-6, fast_mode=True
     )
+
+
+@pytest.mark.parametrize("density, colour", [(0.7, 0.0), (0.0, 0.3), (0.2, 0.5)])
+def test_roughness_of_a_ramp(density, colour):
+    """Raw density and red rise along x by the same in each of four leaves: four of twelve edges differ, in each leaf that
+    the ray crosses whole. Another ray crosses one leaf from corner to corner: the way counts in sides of the leaf."""
+    grid = np.argwhere(np.ones((4, 4, 4)))
+    octree = Octree.from_leaves(np.full(64, 2), grid, (0, 0, 0), 2.0, 0, 0.01)
+    x = octree.vertex_positions()[:, 0]
+    octree.density, red = 5.0 * x, np.zeros((len(x), 3, 1))
+    red[:, 0, 0] = 0.3 * x
+    octree.sh = red
+    d_raw, d_red = 5.0 * 0.5, 0.3 * 0.5
+    edges = 4 * (density * (d_raw - math.log(1 + d_raw)) + colour * (d_red - 0.1 * math.log(1 + d_red / 0.1)))
+    o, d = rays64([[-1, 0.3, 0.3], [2.5, 2.5, 2.5]], [[1, 0, 0], -np.ones(3) / math.sqrt(3)])
+    values, target = torch.from_numpy(octree.values).double(), torch.zeros(2, 3, dtype=torch.float64)
+    weight = torch.tensor([0.5, 2.0], dtype=torch.float64)
+    smooth, plain = (
+        reference.loss(octree, values, o, d, target, weight, ops.LossOptions(**terms, early_stop_eps=0.0))[0].item()
+        for terms in ({"smooth_density": density, "smooth_colour": colour}, {})
+    )
+    assert smooth - plain == pytest.approx((0.5 * 4 + 2.0 * 4 * math.sqrt(3)) * edges, rel=1e-6)
 
 
 def test_a_homogeneous_slab_is_exp_minus_sigma_l_however_it_is_cut():

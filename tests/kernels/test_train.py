@@ -18,7 +18,8 @@ LOSSES = {
     "plain": ops.LossOptions(BACKGROUND, early_stop_eps=0.0),
     "colour": ops.LossOptions(BACKGROUND, colour=0.3, early_stop_eps=0.0),
     "distortion": ops.LossOptions(BACKGROUND, distortion=0.5, early_stop_eps=0.0),
-    "all": ops.LossOptions(BACKGROUND, colour=0.1, distortion=0.2, early_stop_eps=0.0),
+    "smooth": ops.LossOptions(BACKGROUND, smooth_density=0.02, smooth_colour=0.1, early_stop_eps=0.0),
+    "all": ops.LossOptions(BACKGROUND, 0.1, 0.2, 0.003, 0.02, early_stop_eps=0.0),
 }
 PIXEL_ANGLE = 0.01
 
@@ -63,7 +64,8 @@ def loss_bound(case: Case, loss: str) -> np.ndarray:
     d_q = 8 * U * q + d_g @ np.abs(BACKGROUND)
     np.maximum.at(q, t.ray, share)
     np.maximum.at(d_q, t.ray, d_share)
-    return rounding.gradient_bounds(t, octree, g_hit, q, d_g_hit, d_q)
+    smooth = rounding.roughness_bounds(t, octree, weight, options.smooth_density, options.smooth_colour)
+    return rounding.gradient_bounds(t, octree, g_hit, q, d_g_hit, d_q) + smooth
 
 
 def kernel_loss_gradient(case: Case, options: ops.LossOptions) -> np.ndarray:
@@ -81,7 +83,7 @@ def test_gradient_of_the_loss(isa, degree, loss):
     assert np.linalg.norm(bound) < 0.1 * np.linalg.norm(theirs)
 
 
-@pytest.mark.parametrize("term", ["colour", "distortion"])
+@pytest.mark.parametrize("term", ["colour", "distortion", "smooth"])
 def test_each_term_of_the_loss_has_a_gradient_that_the_bounds_would_miss_if_it_were_lost(term):
     case = Case("mixed", 1, 201, "odd", n=3, distance=(0.8, 1.3))
     lost = np.abs(true_loss_gradient(case, term) - true_loss_gradient(case, "plain"))
@@ -250,6 +252,10 @@ def test_the_loss_is_what_it_says():
         octree, as64(octree.values), as64(o), as64(d), as64(batch.target), as64(batch.weight), options
     )
     t, expected = traced(case), 0.0
+    corners = octree.values.astype(float)[octree.corners[t.leaf]]
+    slots = sh_slots(octree.sh_degree).flatten()
+    edges = [(a, b) for a in range(8) for b in range(a) if (a ^ b) in (1, 2, 4)]
+    sides = (t.far - t.near) / octree.leaf_sizes()[t.leaf]
     for ray in range(len(d)):
         mine = t.ray == ray
         w, c, m = t.weight[mine], t.colour[mine], t.middle[mine] / octree.size
@@ -259,5 +265,10 @@ def test_the_loss_is_what_it_says():
         term += options.colour * (w @ ((c - target) ** 2).sum(1) + final * ((BACKGROUND - target) ** 2).sum())
         pairs = sum(w[i] * w[j] * abs(m[i] - m[j]) for i in range(len(w)) for j in range(len(w)))
         term += options.distortion * (pairs + (w * w * length).sum() / 3)
+        for i in np.flatnonzero(mine):
+            for a, b in edges:
+                away = np.abs(corners[i, a] - corners[i, b])
+                term += options.smooth_density * sides[i] * (away[12] - np.log(1 + away[12]))
+                term += options.smooth_colour * sides[i] * (away[slots] - 0.1 * np.log(1 + away[slots] / 0.1)).sum()
         expected += batch.weight[ray] * term
     assert float(total) == pytest.approx(expected, rel=1e-12)

@@ -143,9 +143,10 @@ void forward_packet(const Tree& tree, Packet<1>& p, const BasisRows<B>& basis, f
 struct Adjoint {
     f4 colour[kTile];                      // dL/dC, and dL/d(expected distance in root cubes)
     float behind[kTile];                   // S: starts at T_N q_N
-    float target[kTile][3], colour_weight[kTile], distortion_weight[kTile], error[kTile];
+    float target[kTile][3], colour_weight[kTile], distortion_weight[kTile], error[kTile], ray_weight[kTile];
     float weight_sum[kTile], moment_sum[kTile];          // over all hits, for the distortion loss
     float weight_behind[kTile], moment_behind[kTile];
+    float smooth_density = 0, smooth_colour = 0;
 };
 
 inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState<1>& s,
@@ -159,12 +160,14 @@ inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const R
         if (c.depth) g[3] = c.depth[i] * tree.size;
         a.colour[l] = g;
         a.behind[l] = s.trans[l] * q;
-        a.colour_weight[l] = a.distortion_weight[l] = a.error[l] = 0;
+        a.colour_weight[l] = a.distortion_weight[l] = a.error[l] = a.ray_weight[l] = 0;
         a.weight_sum[l] = a.moment_sum[l] = 0;
     }
 }
 
 inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t first, int n, Adjoint& a, StepReport& report) {
+    a.smooth_density = loss.smooth_density;
+    a.smooth_colour = loss.smooth_colour;
     for (int l = 0; l < n; ++l) {
         const float* target = loss.target + 3 * (first + l);
         const float weight = loss.weight[first + l];
@@ -184,10 +187,34 @@ inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t f
         a.colour_weight[l] = weight * loss.colour;
         a.distortion_weight[l] = weight * loss.distortion;
         a.error[l] = weight * error;
+        a.ray_weight[l] = weight;
         a.weight_sum[l] = 1 - s.trans[l];
         a.moment_sum[l] = s.colour[l][3];
         report.squared_error += double(weight) * error;
         report.weight += weight;
+    }
+}
+
+// Differences below these count by their squares, larger ones as they are: an edge of the scene is no worse than a slope.
+constexpr float kSmoothDensity = 1.0f, kSmoothColour = 0.1f;
+
+// Adds to the gradients of a leaf's corners that of their differences d along its edges, the sum of weight * (|d| - e log(1 +
+// |d| / e)) over edges and numbers of a vertex row: a total variation [Plenoxels] that is smooth at zero.
+template <int B> void smooth_corners(const Tree& tree, const int32_t* corners, float density, float colour, f16 (&gradient)[8][B]) {
+    const f4 rgb = {colour, colour, colour, colour}, knee = {kSmoothColour, kSmoothColour, kSmoothColour, kSmoothColour};
+    const f4 raw = {kSmoothDensity, kSmoothDensity, kSmoothDensity, kSmoothDensity};
+    for (int k = 0; k < B; ++k) {
+        const f16 weight = k == 0 ? join(rgb, rgb, rgb, f4{density, 0, 0, 0}) : splat16(colour);
+        const f16 e = k == 0 ? join(knee, knee, knee, raw) : splat16(kSmoothColour);
+        f16 value[8];
+        for (int o = 0; o < 8; ++o) value[o] = load<f16>(tree.values + 16 * (B * int64_t(corners[o]) + k));
+        for (int axis = 1; axis < 8; axis *= 2)
+            for (int o = 0; o < 8; ++o)
+                if (o & axis) {
+                    const f16 d = value[o] - value[o ^ axis], slope = weight * d / (e + vmax(d, -d));
+                    gradient[o][k] += slope;
+                    gradient[o ^ axis][k] -= slope;
+                }
     }
 }
 
@@ -196,6 +223,7 @@ template <int B>
 void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& work, Adjoint& a, VertexTable& table,
                      VertexGradients& gradients) {
     const float per_length = 1.0f / tree.size;
+    const bool smooths = a.smooth_density > 0 || a.smooth_colour > 0;
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
     gradients.start(8 * work.visits.size(), 16 * B);
     table.start(8 * work.visits.size());
@@ -203,6 +231,7 @@ void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& wor
         Visit& visit = work.visits[v];
         const Hit* h = work.hits.get() + work.first_hit[v];
         f16 corner[8][B] = {};
+        float crossed = 0;                   // ways of the rays through the leaf, by their weights
         for (int i = 0; i < visit.n_hits; ++i) {
             const int l = h[i].lane;
             const float w = h[i].weight;
@@ -229,6 +258,7 @@ void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& wor
             gradient[3] = (h[i].trans_after * q - a.behind[l]) * h[i].tau_slope;
             a.behind[l] += w * q;
             visit.error += w * a.error[l];
+            crossed += a.ray_weight[l] * h[i].length;
 
             alignas(32) float share[8];
             store(share, trilinear(h[i].fx, h[i].fy, h[i].fz));
@@ -240,6 +270,10 @@ void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& wor
             }
         }
         const int32_t* corners = tree.corners + 8 * int64_t(visit.leaf);
+        if (smooths) {
+            const float sides = crossed * per_length / visit.side;
+            smooth_corners<B>(tree, corners, a.smooth_density * sides, a.smooth_colour * sides, corner);
+        }
         for (int o = 0; o < 8; ++o) table.add(corners[o], corner[o], gradients);
     }
 }

@@ -128,13 +128,15 @@ void py_render_backward(const TreeArrays& t, Rows origins, Rows directions, std:
 // One training step. With `gradient` the dense gradient of the loss is added there and nothing else changes; without it the
 // optimiser updates values and moments.
 nb::tuple py_train_step(const TreeArrays& t, Rows origins, Rows directions, Rows target, In<float, nb::ndim<1>> weight,
-                        std::vector<float> background, float eps, float colour, float distortion, float pixel_angle,
+                        std::vector<float> background, float eps, float colour, float distortion,
+                        float smooth_density, float smooth_colour, float pixel_angle,
                         Maybe<FloatRows> gradient, Maybe<FloatRows> values, Maybe<FloatRows> moments, std::vector<float> rates,
                         float beta, float opt_eps, Out<int32_t, nb::ndim<1>> slots, Maybe<Floats> max_weight, Maybe<Floats> error,
                         Maybe<Floats> footprint) {
     const Rays rays = make_rays(origins, directions);
     const RenderOptions options = make_options(background, eps);
-    const Loss loss{target.data(), weight.data(), {background[0], background[1], background[2]}, colour, distortion};
+    const Loss loss{target.data(), weight.data(), {background[0], background[1], background[2]},
+                    colour, distortion, smooth_density, smooth_colour};
     const Optimizer optimizer{pointer(values), pointer(moments), rates.at(0), rates.at(1), rates.at(2), beta, opt_eps};
     if (!gradient && (!values || !moments || values->data() != t.tree.values))
         throw std::invalid_argument("the optimiser needs the octree's own values and their moments");
@@ -224,8 +226,8 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("render_backward", &py_render_backward, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a,
           "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "gradient"_a, "slots"_a);
     m.def("train_step", &py_train_step, "tree"_a, "rays_o"_a, "rays_d"_a, "target"_a, "weight"_a, "background"_a,
-          "early_stop_eps"_a, "colour"_a, "distortion"_a, "pixel_angle"_a, "gradient"_a.none(), "values"_a.none(),
-          "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a, "max_weight"_a.none(), "error"_a.none(),
+          "early_stop_eps"_a, "colour"_a, "distortion"_a, "smooth_density"_a, "smooth_colour"_a, "pixel_angle"_a,
+          "gradient"_a.none(), "values"_a.none(), "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a, "max_weight"_a.none(), "error"_a.none(),
           "footprint"_a.none());
     m.def("number_corners", &py_number_corners, "level"_a, "ijk"_a, "max_level"_a, "ids"_a);
     m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);

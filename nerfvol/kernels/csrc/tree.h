@@ -59,6 +59,7 @@ struct Loss {
     float background[3];
     float colour;                                // weight of sum_i w_i |c_i - target|^2 + T |background - target|^2
     float distortion;                            // weight of the distortion loss of Mip-NeRF 360 (distances in root cubes)
+    float smooth_density, smooth_colour;         // weights of differences between the corners of leaves (see smooth_corners)
 };
 
 // RMSprop, applied only to vertices that this batch touched.
