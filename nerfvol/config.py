@@ -21,7 +21,7 @@ import yaml
 
 from nerfvol.errors import InputError
 from nerfvol.files import read_bytes, write_text
-from nerfvol.settings import DistillConfig, FieldConfig
+from nerfvol.settings import DistillConfig, FieldConfig, OctreeConfig
 
 T = TypeVar("T")
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -75,12 +75,6 @@ def positive(value: Any) -> Any:
 Count = Annotated[int, positive]
 
 
-def _octree_section() -> Any:
-    from nerfvol.finetune import OctreeConfig
-
-    return OctreeConfig()
-
-
 @dataclass
 class Config:
     """Everything one training run depends on. ``nerfvol train`` writes it, resolved, to RUN/config.yaml."""
@@ -112,8 +106,8 @@ class Config:
     """Section: the MLP field (nerfvol.settings.FieldConfig)."""
     distill: Any = dataclasses.field(default_factory=DistillConfig)
     """Section: the field's way into the octree (nerfvol.settings.DistillConfig)."""
-    octree: Any = dataclasses.field(default_factory=_octree_section)
-    """Section: the octree and its optimisation (nerfvol.finetune.OctreeConfig)."""
+    octree: OctreeConfig = dataclasses.field(default_factory=OctreeConfig)
+    """Section: the octree and its optimisation (nerfvol.settings.OctreeConfig)."""
 
 
 def assemble(cls: type[T], *layers: tuple[Mapping[str, Any], str]) -> T:

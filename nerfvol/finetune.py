@@ -8,9 +8,7 @@ terms that empty space; RMSprop on touched vertices.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,102 +18,11 @@ from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
 from nerfvol.memory import splits_within
 from nerfvol.octree import Octree, Transfer, convert_rows
-from nerfvol.settings import filled
+from nerfvol.settings import OctreeConfig
 from nerfvol.tiles import Cursor, TileBank
-from nerfvol.topology import MAX_LEVEL
 
-
-@dataclass
-class OctreeConfig:
-    """Settings of the octree's optimisation. Shares of progress lie in [0, 1]."""
-
-    steps: int = 15000
-    """Optimiser steps of the whole schedule when no time budget is given."""
-    most_epochs: float = 40.0
-    """... and when one is given, as many as draw each tile so often at most: a run that comes to them ends early, for more
-    would overfit (docs/performance.md)."""
-    levels: list[int] = field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
-    """Finest level of each stage: level 8 means 256 cells along the region of detail."""
-    downscales: list[int] = field(default_factory=lambda: [16, 8, 4, 2, 1, 1, 1])
-    """Image downscale of each stage."""
-    until: list[float] = field(default_factory=lambda: [0.003, 0.008, 0.03, 0.10, 0.35, 0.60, 1.0])
-    """Share of progress at which each stage ends."""
-    tiles: list[int] = field(default_factory=lambda: [64, 96, 128, 128, 192, 320, 320])
-    """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
-    prunes: list[int] = field(default_factory=lambda: [3, 3, 2, 2, 2, 2, 2])
-    """Prunings inside each stage, evenly spaced."""
-    coverage: float = 0.5
-    """Pruning waits until this share of the tiles that are not plain background was seen (see _seen_enough for the cap)."""
-    prune_steps: int = 20
-    """... and this many steps were made: a thin start needs some to become visible at all, however few the pictures."""
-    sh_degree: int | None = None
-    """Spherical harmonics of the colours: 0 to 3. None: 1, and 2 in photographs, whose surfaces shine."""
-    final_sh_degree: int = 1
-    """... in the last stage, where it is more: for shiny scenes. It costs memory and steps (docs/performance.md)."""
-    rich_share: float = 0.8
-    """Share of a batch drawn from tiles that are not plain background."""
-    colour: float = 0.06
-    """Weight of the per-sample colour term at the start."""
-    distortion: float = 0.05
-    """Weight of the distortion term at the start."""
-    regulariser_decay: float = 0.1
-    """Both weights shrink to this factor over the run."""
-    rate_density: float = 0.3
-    rate_dc: float = 0.07
-    rate_sh: float = 0.006
-    rate_decay: float | None = None
-    """Learning rates shrink exponentially to this factor ... None: 0.04, and 0.02 in photographs."""
-    decay_from: float | None = None
-    """... from this share of progress on. None: 0.8, and 0.35 in photographs, whose noise takes longer to average."""
-    beta: float = 0.98
-    prune_weight: float = 0.005
-    """Leaves whose largest rendering weight since the last pruning is below are removed."""
-    final_prune_weights: list[float] = field(default_factory=lambda: [0.04, 0.02, 0.01])
-    """At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
-    final_prune_loss: float = 0.005
-    """Share by which the squared error of training tiles may grow (0.005 is 0.02 dB); what it takes from the octree is speed
-    and bytes that nobody sees, in thin shells about a tenth, in thick media nothing."""
-    whole_pixels: float = 2.5
-    """Stages split all leaves larger than this many pixels of their images in some view, down to their level, until ..."""
-    fine_from: int = 9
-    """... this level; from there on a stage splits leaves once, ..."""
-    subdivide_pixels: float = 1.5
-    """... those larger than this many pixels ..."""
-    subdivide_error: float = 0.7
-    """... that are among the fewest to hold this share of the squared error."""
-    fine_steps: int = 2500
-    """A stage from level ``fine_from`` on is left out where fewer steps would be left for it."""
-    early_stop_eps: float = 4e-3
-    """Training rays end when their transmittance falls below."""
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in RANGES.items():
-            given = getattr(self, name)
-            for value in given if isinstance(given, list) else [given]:
-                if value is not None and not low <= value <= high:
-                    raise InputError(f"octree.{name} must lie between {low:g} and {high:g}, got {value:g}")
-
-    def for_scene(self, scene: SceneBounds) -> OctreeConfig:
-        """The same with a number for each None; photographs are scenes with surroundings."""
-        return filled(self, BOUNDED if scene.background_cube is None else PHOTOGRAPHS)
-
-
-RANGES = {
-    "steps": (1, math.inf), "most_epochs": (0.1, math.inf), "levels": (1, MAX_LEVEL), "downscales": (1, 256),
-    "until": (0, 1), "tiles": (1, 1 << 20),
-    "prunes": (0, math.inf), "coverage": (0, math.inf), "prune_steps": (0, math.inf), "sh_degree": (0, 3),
-    "final_sh_degree": (0, 3), "rich_share": (0, 1), "colour": (0, math.inf), "distortion": (0, math.inf),
-    "regulariser_decay": (1e-9, 1), "rate_density": (0, 1e3), "rate_dc": (0, 1e3), "rate_sh": (0, 1e3),
-    "rate_decay": (1e-9, 1), "decay_from": (0, 0.999), "beta": (0, 0.9999), "prune_weight": (0, math.inf),
-    "final_prune_weights": (0, 1), "final_prune_loss": (0, math.inf), "whole_pixels": (0, math.inf), "fine_from": (0, math.inf),
-    "subdivide_pixels": (0, math.inf), "subdivide_error": (0, 1), "fine_steps": (0, math.inf), "early_stop_eps": (0, 0.999),
-}  # fmt: skip
-"""Smallest and largest value of each setting, and of each entry of a list."""
-BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8}
-PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35}
-"""Settings of an octree where nothing else is said."""
-
-
+BEHIND = 2
+"""Stream of random numbers of the colours behind photographs; TileBank has 0 and 1."""
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
 FINAL_TILES = 4096
@@ -199,7 +106,9 @@ class OctreeTrainer:
         if self.bank is None:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
-        options = ops.LossOptions(self.background, c.colour * fade, c.distortion * fade, c.early_stop_eps)
+        smooth = fade if self.step_count >= c.smooth_from else 0.0
+        terms = c.colour * fade, c.distortion * fade, c.smooth_density * smooth, c.smooth_colour * smooth
+        options = ops.LossOptions(self._behind(), *terms, c.early_stop_eps)
         late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
         rate = c.rate_decay**late
         rates = ops.Rates(c.rate_density * rate, c.rate_dc * rate, c.rate_sh * rate, c.beta)
@@ -208,6 +117,16 @@ class OctreeTrainer:
         self.step_count += 1
         self.tiles_seen += c.tiles[self.stage]
         return report
+
+    def _behind(self) -> tuple[float, ...]:
+        """What this step's rays see where they leave the octree: the background.
+
+        In photographs another colour each step, for they have none, and nothing in them may rely on one.
+        """
+        if self.dataset.scene.background_cube is None:
+            return self.background
+        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, BEHIND, self.step_count])))
+        return tuple(random.random(3).tolist())
 
     def _make_bank(self) -> TileBank:
         return TileBank(self.dataset, self.background, self.config.downscales[self.stage])
@@ -218,22 +137,29 @@ class OctreeTrainer:
         old, self.stage, self.prunings = self.stage, self.stage + 1, 0
         error, footprint = self.prune()
         footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
-        wanted, fine = c.levels[self.stage], c.levels[self.stage] >= c.fine_from
-        for _ in range(1 if fine else wanted):
-            split = footprint > (c.subdivide_pixels if fine else c.whole_pixels)
-            split &= self.octree.leaf_level < leaf_limits(self.octree, self.dataset.scene, wanted)
-            if fine:
-                split &= holds_share(error, c.subdivide_error)
-            split = splits_within(split, error, self.max_leaves)
-            if not split.any():
+        fine = c.levels[self.stage] >= c.fine_from
+        for _ in range(1 if fine else c.levels[self.stage]):
+            transfer = self._split(error, footprint, c.subdivide_error if fine else c.coarse_error)
+            if transfer is None:
                 break
-            transfer = self._change(*self.octree.subdivide(split))
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
         if self.stage + 1 == len(c.levels) and c.final_sh_degree > self.octree.sh_degree:
             self._grow_sh(c.final_sh_degree)
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
             self.rich, self.plain = Cursor(), Cursor()
+
+    def _split(self, error: np.ndarray, footprint: np.ndarray, share: float) -> Transfer | None:
+        """Splits the leaves that this stage wants finer, among those that hold ``share`` of the error; None: there are none.
+
+        error, footprint (in pixels of this stage's images): (n_leaves,).
+        """
+        c, level = self.config, self.config.levels[self.stage]
+        split = footprint > (c.subdivide_pixels if level >= c.fine_from else c.whole_pixels)
+        split &= self.octree.leaf_level < leaf_limits(self.octree, self.dataset.scene, level)
+        split &= holds_share(error, share)
+        split = splits_within(split, error, self.max_leaves)
+        return self._change(*self.octree.subdivide(split)) if split.any() else None
 
     def _grow_sh(self, degree: int) -> None:
         """The same field with more bands, which begin at zero."""
@@ -242,10 +168,10 @@ class OctreeTrainer:
         self.state = ops.TrainState(self.octree, moments)
 
     def _worth_splitting(self, progress: float) -> bool:
-        """Whether the next stage, if it is a fine one, will have the steps that it needs at the pace so far."""
-        c = self.config
+        """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
+        c, stage = self.config, self.stage + 1
         left = self.step_count * (1 - progress) / max(progress - self._start, 1e-9)
-        return c.levels[self.stage + 1] < c.fine_from or left >= c.fine_steps
+        return left >= (c.fine_steps if c.levels[stage] >= c.fine_from else c.prunes[stage] * c.prune_steps)
 
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
@@ -256,6 +182,7 @@ class OctreeTrainer:
         return self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
 
     def _prune_inside_stage(self, progress: float) -> None:
+        """Prunes where it is due, and splits where that pays."""
         c = self.config
         start = c.until[self.stage - 1] if self.stage else 0.0
         due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
@@ -264,10 +191,11 @@ class OctreeTrainer:
             and progress >= start + due * (c.until[self.stage] - start)
             and self._seen_enough()
         ):
-            if 1 - self._needed(self.config.prune_weight).mean() < WORTH_PRUNING:
+            error, footprint = self.state.error, self.state.footprint
+            if 1 - self._needed(c.prune_weight).mean() >= WORTH_PRUNING:
+                error, footprint = self.prune()
+            if not c.growing_error or self._split(error, footprint, c.growing_error) is None:
                 self._start_anew()
-            else:
-                self.prune()
             self.prunings += 1
 
     def _needed(self, weight: float) -> np.ndarray:
@@ -289,7 +217,6 @@ class OctreeTrainer:
     def prune(self) -> tuple[np.ndarray, np.ndarray]:
         """Removes leaves that no ray needed; error and footprint of those that stay."""
         keep = self._needed(self.config.prune_weight)
-        self.tiles_seen = 0
         if not keep.any():
             raise InputError(
                 f"the octree collapsed to empty space at step {self.step_count}: no training ray needs any of it; check "
@@ -334,6 +261,7 @@ class OctreeTrainer:
     def _change(self, octree: Octree, transfer: Transfer) -> Transfer:
         self.octree = octree  # the old values go before the moments follow
         self.state = ops.TrainState(octree, transfer.vertices(self.state.moments))
+        self.tiles_seen = 0
         return transfer
 
 

@@ -1,4 +1,4 @@
-"""Settings of the field, of its training and of its distillation, and constants that commands and operators share.
+"""Settings of field, distillation and octree, and constants that commands and operators share.
 
 They stand apart from the modules that they steer because those import torch or numpy, which costs seconds: every command
 reads the settings, few use a field.
@@ -7,6 +7,7 @@ reads the settings, few use a field.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
@@ -158,6 +159,112 @@ class DistillConfig:
     def for_scene(self, scene: SceneBounds) -> DistillConfig:
         """The same with a number for each None; photographs are scenes with surroundings."""
         return filled(self, {"level": 8 if scene.background_cube is None else 6})
+
+
+@dataclasses.dataclass
+class OctreeConfig:
+    """Settings of the octree's optimisation. Shares of progress lie in [0, 1]."""
+
+    steps: int = 15000
+    """Optimiser steps of the whole schedule when no time budget is given."""
+    most_epochs: float = 40.0
+    """... and when one is given, as many as draw each tile so often at most: a run that comes to them ends early, for more
+    would overfit (docs/performance.md)."""
+    levels: list[int] = dataclasses.field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
+    """Finest level of each stage: level 8 means 256 cells along the region of detail."""
+    downscales: list[int] = dataclasses.field(default_factory=lambda: [16, 8, 4, 2, 1, 1, 1])
+    """Image downscale of each stage."""
+    until: list[float] = dataclasses.field(default_factory=lambda: [0.003, 0.008, 0.03, 0.10, 0.35, 0.60, 1.0])
+    """Share of progress at which each stage ends."""
+    tiles: list[int] = dataclasses.field(default_factory=lambda: [64, 96, 128, 128, 192, 320, 320])
+    """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
+    prunes: list[int] = dataclasses.field(default_factory=lambda: [3, 3, 2, 2, 2, 2, 2])
+    """Prunings inside each stage, evenly spaced."""
+    coverage: float = 0.5
+    """Pruning waits until this share of the tiles that are not plain background was seen (see _seen_enough for the cap)."""
+    prune_steps: int = 20
+    """... and this many steps were made: a thin start needs some to become visible at all, however few the pictures."""
+    sh_degree: int | None = None
+    """Spherical harmonics of the colours: 0 to 3. None: 1, and 2 in photographs, whose surfaces shine."""
+    final_sh_degree: int = 1
+    """... in the last stage, where it is more: for shiny scenes. It costs memory and steps (docs/performance.md)."""
+    rich_share: float = 0.8
+    """Share of a batch drawn from tiles that are not plain background."""
+    colour: float = 0.06
+    """Weight of the per-sample colour term at the start."""
+    distortion: float = 0.05
+    """Weight of the distortion term at the start."""
+    smooth_density: float | None = None
+    """Weight of differences of raw density between the corners of leaves (reference.roughness). None: 6e-5, and 2e-5 in
+    photographs."""
+    smooth_colour: float | None = None
+    """... and of their colours' coefficients. None: 6e-5, and 4e-5 in photographs."""
+    smooth_from: int | None = None
+    """The step from which on both count. None: 1000, for at first objects have nothing that could overfit; 0 in photographs."""
+    regulariser_decay: float = 0.1
+    """The weights of all four terms shrink to this factor over the run."""
+    rate_density: float = 0.3
+    rate_dc: float = 0.07
+    rate_sh: float = 0.006
+    rate_decay: float | None = None
+    """Learning rates shrink exponentially to this factor ... None: 0.04, and 0.02 in photographs."""
+    decay_from: float | None = None
+    """... from this share of progress on. None: 0.8, and 0.35 in photographs, whose noise takes longer to average."""
+    beta: float = 0.98
+    prune_weight: float = 0.005
+    """Leaves whose largest rendering weight since the last pruning is below are removed."""
+    final_prune_weights: list[float] = dataclasses.field(default_factory=lambda: [0.04, 0.02, 0.01])
+    """At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
+    final_prune_loss: float = 0.005
+    """Share by which the squared error of training tiles may grow (0.005 is 0.02 dB); what it takes from the octree is speed
+    and bytes that nobody sees, in thin shells about a tenth, in thick media nothing."""
+    whole_pixels: float = 2.5
+    """A stage begins by splitting leaves larger than this many pixels of its images in some view, down to its level, ..."""
+    coarse_error: float | None = None
+    """... that are among the fewest to hold this share of the squared error. None: 0.9, and 0.5 in photographs, where much
+    of what rays cross is haze that will be pruned."""
+    fine_from: int = 9
+    """From this level on a stage splits leaves once, ..."""
+    subdivide_pixels: float = 1.5
+    """... those larger than this many pixels ..."""
+    subdivide_error: float = 0.7
+    """... that are among the fewest to hold this share of the squared error."""
+    growing_error: float | None = None
+    """Each pruning inside a stage splits leaves too, once, by this share. None: 0 (none), and 0.5 in photographs."""
+    fine_steps: int = 2500
+    """A stage from level ``fine_from`` on is left out where fewer steps would be left for it."""
+    early_stop_eps: float = 4e-3
+    """Training rays end when their transmittance falls below."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in OCTREE_RANGES.items():
+            given = getattr(self, name)
+            for value in given if isinstance(given, list) else [given]:
+                if value is not None and not low <= value <= high:
+                    raise InputError(f"octree.{name} must lie between {low:g} and {high:g}, got {value:g}")
+
+    def for_scene(self, scene: SceneBounds) -> OctreeConfig:
+        """The same with a number for each None; photographs are scenes with surroundings."""
+        return filled(self, BOUNDED if scene.background_cube is None else PHOTOGRAPHS)
+
+
+OCTREE_RANGES = {
+    "steps": (1, math.inf), "most_epochs": (0.1, math.inf), "levels": (1, 16), "downscales": (1, 256), "until": (0, 1),
+    "tiles": (1, 1 << 20), "prunes": (0, math.inf), "coverage": (0, math.inf), "prune_steps": (0, math.inf),
+    "sh_degree": (0, 3), "final_sh_degree": (0, 3), "rich_share": (0, 1), "colour": (0, math.inf), "distortion": (0, math.inf),
+    "smooth_density": (0, math.inf), "smooth_colour": (0, math.inf), "smooth_from": (0, math.inf),
+    "regulariser_decay": (1e-9, 1), "rate_density": (0, 1e3), "rate_dc": (0, 1e3), "rate_sh": (0, 1e3),
+    "rate_decay": (1e-9, 1), "decay_from": (0, 0.999), "beta": (0, 0.9999),
+    "prune_weight": (0, math.inf), "final_prune_weights": (0, 1), "final_prune_loss": (0, math.inf),
+    "whole_pixels": (0, math.inf), "coarse_error": (0, 1), "fine_from": (0, math.inf), "subdivide_pixels": (0, math.inf),
+    "subdivide_error": (0, 1), "growing_error": (0, 1), "fine_steps": (0, math.inf), "early_stop_eps": (0, 0.999),
+}  # fmt: skip
+"""Smallest and largest value of each setting of an octree, and of each entry of a list; levels end where topology's do."""
+BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,
+           "smooth_density": 6e-5, "smooth_colour": 6e-5, "smooth_from": 1000}  # fmt: skip
+PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
+               "smooth_density": 2e-5, "smooth_colour": 4e-5, "smooth_from": 0}  # fmt: skip
+"""Settings of an octree where nothing else is said."""
 
 
 def filled(settings: T, automatic: Mapping[str, Any]) -> T:

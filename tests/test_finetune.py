@@ -6,11 +6,13 @@ import weakref
 import numpy as np
 import pytest
 
-from nerfvol.datasets import load_dataset
+from nerfvol.datasets import Dataset, load_dataset
 from nerfvol.errors import InputError
-from nerfvol.finetune import RANGES, OctreeConfig, OctreeTrainer
+from nerfvol.finetune import OctreeTrainer
+from nerfvol.kernels import ops
 from nerfvol.octree import DENSITY_SLOT, Octree
 from nerfvol.render import render_image
+from nerfvol.settings import OCTREE_RANGES, OctreeConfig
 from nerfvol.topology import MAX_LEVEL
 
 
@@ -140,7 +142,7 @@ def test_settings_that_mean_nothing_are_refused(tiny_scene, tmp_path, command, s
 
 def test_every_number_has_a_range():
     """A setting that is added without one would go unchecked."""
-    assert set(RANGES) == {f.name for f in dataclasses.fields(OctreeConfig)}
+    assert set(OCTREE_RANGES) == {f.name for f in dataclasses.fields(OctreeConfig)}
 
 
 def test_stages_need_settings_each(tiny_scene):
@@ -150,23 +152,122 @@ def test_stages_need_settings_each(tiny_scene):
 
 def test_photographs_have_settings_of_their_own(tiny_scene):
     """Where nothing else is said; a scene with surroundings is one of photographs."""
-    objects = load_dataset(tiny_scene, "train").scene
-    photographs = dataclasses.replace(objects, background_cube=8 * objects.aabb)
-    chosen = [OctreeConfig().for_scene(scene) for scene in (objects, photographs)]
-    assert [(c.sh_degree, c.rate_decay, c.decay_from) for c in chosen] == [(1, 0.04, 0.8), (2, 0.02, 0.35)]
-    said = OctreeConfig(sh_degree=0, rate_decay=0.5, decay_from=0.1)
+    objects, photographs = (dataset.scene for dataset in of_both_kinds(tiny_scene))
+    automatic = [f.name for f in dataclasses.fields(OctreeConfig) if f.default is None]
+    chosen = [dataclasses.asdict(OctreeConfig().for_scene(scene)) for scene in (objects, photographs)]
+    for name in automatic:
+        assert chosen[0][name] is not None and chosen[0][name] != chosen[1][name]
+    assert [(c["sh_degree"], c["decay_from"], c["growing_error"]) for c in chosen] == [(1, 0.8, 0.0), (2, 0.35, 0.5)]
+    said = OctreeConfig(**dict.fromkeys(automatic, 0.25) | {"sh_degree": 0})
     assert said.for_scene(photographs) == said == said.for_scene(objects)
 
 
-def test_a_run_has_the_settings_of_its_scene(tiny_scene):
+def of_both_kinds(tiny_scene) -> list[Dataset]:
+    """The scene as an object and, with surroundings, as one of photographs."""
     dataset = load_dataset(tiny_scene, "train")
-    photographs = dataclasses.replace(
-        dataset, scene=dataclasses.replace(dataset.scene, background_cube=8 * dataset.scene.aabb)
-    )
+    around = dataclasses.replace(dataset.scene, background_cube=8 * dataset.scene.aabb)
+    return [dataset, dataclasses.replace(dataset, scene=around)]
+
+
+def test_a_run_has_the_settings_of_its_scene(tiny_scene):
     config = OctreeConfig(levels=[3], downscales=[4], until=[1.0], tiles=[8], prunes=[0])
-    for images, degree in [(dataset, 1), (photographs, 2)]:
+    for images, degree in zip(of_both_kinds(tiny_scene), (1, 2), strict=True):
         trainer = OctreeTrainer(images, (1, 1, 1), config, 0, None)
         assert trainer.octree.sh_degree == degree
+
+
+@pytest.mark.parametrize("progress, begins", [(0.5, False), (0.3, True)])
+def test_a_coarse_stage_needs_steps_for_its_prunings(tiny_scene, monkeypatch, progress, begins):
+    """Two prunings take 40 steps: 30 in half of a run leave 30, in three tenths 70."""
+    config = OctreeConfig(levels=[3, 4], downscales=[4, 4], until=[0.1, 1.0], tiles=[8, 8], prunes=[0, 2], coverage=0)
+    steps_taken(monkeypatch)
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    for _ in range(30):
+        tuner.step(0.05)
+    with_error_in(tuner, np.arange(512) % 100 == 0)
+    tuner.step(progress)
+    assert tuner.stage == begins
+
+
+def steps_taken(monkeypatch) -> list[ops.LossOptions]:
+    """Options of the steps to come, which do nothing."""
+    seen = []
+
+    def train_step(octree, state, batch, options, *rest):
+        seen.append(options)
+        return ops.StepReport(0.1, 1.0)
+
+    monkeypatch.setattr(ops, "train_step", train_step)
+    return seen
+
+
+def test_terms_of_the_loss_fade_and_smoothness_waits(tiny_scene, monkeypatch):
+    config = OctreeConfig(
+        levels=[3], downscales=[4], until=[1.0], tiles=[8], prunes=[0], colour=0.5, distortion=0.25, smooth_density=1.0,
+        smooth_colour=2.0, smooth_from=2, regulariser_decay=0.01,
+    )  # fmt: skip
+    seen = steps_taken(monkeypatch)
+    trainer = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    for progress in (0.0, 0.5, 0.5, 1.0):
+        trainer.step(progress)
+    found = [(o.colour, o.distortion, o.smooth_density, o.smooth_colour) for o in seen]
+    expected = [(0.5, 0.25, 0, 0), (0.05, 0.025, 0, 0), (0.05, 0.025, 0.1, 0.2), (0.005, 0.0025, 0.01, 0.02)]
+    assert np.allclose(found, expected, rtol=1e-12, atol=0)
+
+
+def test_photographs_have_another_colour_behind_them_each_step(tiny_scene, monkeypatch):
+    """The same ones in a run that was stopped and resumed; objects have their background."""
+    options = steps_taken(monkeypatch)
+    config = OctreeConfig(levels=[3], downscales=[4], until=[1.0], tiles=[8], prunes=[0])
+    objects, photographs = of_both_kinds(tiny_scene)
+    for resumed in (False, True):
+        for dataset in (objects, photographs):
+            trainer = OctreeTrainer(dataset, (1, 1, 0.5), config, 3, None)
+            for step in range(4):
+                if resumed and step == 2:
+                    state, trainer = trainer.state_dict(), OctreeTrainer(dataset, (1, 1, 0.5), config, 3, None)
+                    trainer.load_state_dict(state)
+                trainer.step(0.1)
+    seen = [o.background for o in options]
+    assert seen[:8] == seen[8:] and seen[:4] == [(1, 1, 0.5)] * 4
+    colours = np.array(seen[4:8])
+    assert ((colours >= 0) & (colours < 1)).all() and (np.ptp(colours, axis=0) > 0.1).all()
+
+
+def with_error_in(tuner: OctreeTrainer, few: np.ndarray) -> None:
+    """All leaves were met, are large and needed; nearly all of the error is in a few."""
+    tuner.state.max_weight[:] = 1.0
+    tuner.state.footprint[:] = 100.0
+    tuner.state.error[:] = np.where(few, 1.0, 1e-6)
+
+
+def test_a_coarse_stage_splits_what_holds_the_error(tiny_scene):
+    """Down to its level; what is around it, haze that will be pruned, stays as it is."""
+    config = OctreeConfig(
+        levels=[3, 5], downscales=[4, 4], until=[0.1, 1.0], tiles=[8, 8], prunes=[0, 0], coarse_error=0.99
+    )
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    few = np.arange(512) % 100 == 0
+    with_error_in(tuner, few)
+    centers = tuner.octree.leaf_centers()
+    tuner.next_stage()
+    assert tuner.octree.n_leaves == 512 - 6 + 6 * 64
+    assert (tuner.octree.leaf_level[tuner.octree.query(centers + 1e-6)] == np.where(few, 5, 3)).all()
+
+
+@pytest.mark.parametrize("share, leaves", [(0.0, 512), (0.99, 512 + 6 * 7)])
+def test_a_stage_grows_where_the_error_is(tiny_scene, share, leaves):
+    """At its prunings, also where there is nothing to prune, once each time and where asked for; and then looks anew."""
+    config = OctreeConfig(
+        levels=[3, 5], downscales=[4, 4], until=[0.1, 1.0], tiles=[8, 8], prunes=[0, 1], prune_steps=1, coverage=0,
+        coarse_error=0.0, growing_error=share,
+    )  # fmt: skip
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    tuner.stage = 1
+    tuner.step(0.1)
+    with_error_in(tuner, np.arange(512) % 100 == 0)
+    tuner.step(0.9)
+    assert tuner.octree.n_leaves == leaves and tuner.prunings == 1 and tuner.tiles_seen == 8
 
 
 @pytest.mark.parametrize("share, prunes", [(0.04, False), (0.06, True)])
