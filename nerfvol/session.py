@@ -150,7 +150,7 @@ class Run:
         """About so many training tiles are not plain background."""
         held = self.held_out.nbytes or self._first.nbytes + self.comparison_views.nbytes
         self._beside = Beside(share, held, field=config.init == "mlp")
-        wanted = largest_octree(config.octree.levels, lens.width * lens.height)
+        wanted = largest_octree(config.octree.levels, lens.width * lens.height, scene.background_cube is not None)
         self.max_leaves = affordable_leaves(self.dataset, self._degree, least=min(wanted, 1 << 18), beside=self._beside)
         self._reckoned = min(wanted, self.max_leaves)
         estimate = estimate_training(self.dataset, self._reckoned, self._degree, self._beside)

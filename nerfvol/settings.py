@@ -167,7 +167,7 @@ class OctreeConfig:
 
     steps: int = 15000
     """Optimiser steps of the whole schedule when no time budget is given."""
-    most_epochs: float = 40.0
+    most_epochs: float = 60.0
     """... and when one is given, as many as draw each tile so often at most: a run that comes to them ends early, for more
     would overfit (docs/performance.md)."""
     levels: list[int] = dataclasses.field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])

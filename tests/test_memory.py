@@ -104,6 +104,7 @@ def test_an_octree_is_bounded_by_its_surface_the_pixels_and_its_start():
     assert largest_octree([6], 10**9) == 8**6 and largest_octree([2, 6], 10**9) == 12 * 4**6
     assert largest_octree([4, 9, 5], 10**9) == 12 * 4**9
     assert largest_octree([5, 9, 10], 800 * 800) == int(2.2 * 800 * 800)
+    assert largest_octree([5, 9, 10], 800 * 800, photographs=True) == int(0.8 * 800 * 800)
     assert largest_octree([5, 9, 10], 100) == 8**5
 
 

@@ -18,7 +18,7 @@ LOSSES = {
     "plain": ops.LossOptions(BACKGROUND, early_stop_eps=0.0),
     "colour": ops.LossOptions(BACKGROUND, colour=0.3, early_stop_eps=0.0),
     "distortion": ops.LossOptions(BACKGROUND, distortion=0.5, early_stop_eps=0.0),
-    "smooth": ops.LossOptions(BACKGROUND, smooth_density=0.02, smooth_colour=0.1, early_stop_eps=0.0),
+    "smooth": ops.LossOptions(BACKGROUND, smooth_colour=0.1, early_stop_eps=0.0),
     "all": ops.LossOptions(BACKGROUND, 0.1, 0.2, 0.003, 0.02, early_stop_eps=0.0),
 }
 PIXEL_ANGLE = 0.01
