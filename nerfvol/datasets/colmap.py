@@ -94,11 +94,13 @@ def _doubt(model: Path, frames: dict[int, Frame]) -> list[str]:
             continue
         frame = frames[number]
         lens, (width, height) = frame.calibration, (frame.calibration.width or 0, frame.calibration.height or 0)
-        right, up, back = ((np.array(places) - frame.c2w[:3, 3]) @ frame.c2w[:3, :3]).T
-        # Distances from the middle of the image, in pixels, times -back: nothing behind a camera is within a negative bound.
-        x = np.abs((lens.fx or 0) * right - ((lens.cx or 0) - width / 2) * back)
-        y = np.abs((lens.fy or 0) * -up - ((lens.cy or 0) - height / 2) * back)
-        inside += int(((x <= -back * _AROUND * width / 2) & (y <= -back * _AROUND * height / 2)).sum())
+        # Distances from the middle of the image, in pixels, times -back: nothing behind a camera is within a negative bound,
+        # and a point that is nowhere (NaN, infinity) is in no image.
+        with np.errstate(invalid="ignore", over="ignore"):
+            right, up, back = ((np.array(places) - frame.c2w[:3, 3]) @ frame.c2w[:3, :3]).T
+            x = np.abs((lens.fx or 0) * right - ((lens.cx or 0) - width / 2) * back)
+            y = np.abs((lens.fy or 0) * -up - ((lens.cy or 0) - height / 2) * back)
+            inside += int(((x < -back * _AROUND * width / 2) & (y < -back * _AROUND * height / 2)).sum())
         total += len(places)
     if not total or inside >= _FITTING * total:
         return []

@@ -114,6 +114,13 @@ def test_poses_that_do_not_fit_the_points_of_the_model_are_doubted(tmp_path, tex
         assert any("these are not the poses of the photographs" in m for m in load_dataset(tmp_path).messages)
 
 
+@pytest.mark.parametrize("nowhere", [np.nan, np.inf, -1e308])
+def test_points_that_are_nowhere_are_in_no_image(tmp_path, nowhere):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), model="PINHOLE")
+    scenes.write_points(tmp_path, scenes.ring(), [(0.0, 0.0, 0.0), (nowhere, nowhere, nowhere)])
+    assert any("only 50 % of what its tracks list" in message for message in load_dataset(tmp_path).messages)
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_damaged_points_are_refused(tmp_path, text):
     scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), text=text)

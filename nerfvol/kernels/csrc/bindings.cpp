@@ -227,7 +227,8 @@ NB_MODULE(_nerfvol_kernels, m) {
           "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "gradient"_a, "slots"_a);
     m.def("train_step", &py_train_step, "tree"_a, "rays_o"_a, "rays_d"_a, "target"_a, "weight"_a, "background"_a,
           "early_stop_eps"_a, "colour"_a, "distortion"_a, "smooth_density"_a, "smooth_colour"_a, "pixel_angle"_a,
-          "gradient"_a.none(), "values"_a.none(), "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a, "max_weight"_a.none(), "error"_a.none(),
+          "gradient"_a.none(), "values"_a.none(), "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a,
+          "max_weight"_a.none(), "error"_a.none(),
           "footprint"_a.none());
     m.def("number_corners", &py_number_corners, "level"_a, "ijk"_a, "max_level"_a, "ids"_a);
     m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);
