@@ -7,20 +7,21 @@ renders a video, all in the folder ``demo``.
 import sys
 from pathlib import Path
 
-from nerfvol import cli
+from nerfvol.cli.main import guard
+from nerfvol.cli.main import main as command
 
 
 def main(arguments: list[str]) -> int:
     """Run the command line; the exit code."""
     if arguments:
-        return cli.main(["train", *arguments])
+        return command(["train", *arguments])
 
     def demo() -> int:
-        from nerfvol.demo import run_demo
+        from nerfvol.cli.demo import run_demo
 
         return run_demo(Path(__file__).resolve().parent / "configs" / "demo.yaml", Path("demo"))
 
-    return cli.guard(demo)
+    return guard(demo)
 
 
 if __name__ == "__main__":

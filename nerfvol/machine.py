@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from nerfvol.options import usable_cores
+from nerfvol.native import native
 
 
 def cpu_model() -> str:
@@ -105,14 +105,17 @@ def process_seconds() -> float:
 
 def describe_hardware() -> dict[str, Any]:
     """cpu, usable cores, memory in GiB, platform and the kernels' build in use, JSON-able."""
-    from nerfvol.kernels import ops
-
-    total = total_memory()
+    total, compiled = total_memory(), native()
     return {
         "cpu": cpu_model(),
         "cores": usable_cores(),
         "memory_gib": None if total is None else round(total / 2**30, 1),
         "platform": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "kernel_path": ops.isa(),
+        "kernel_path": "reference" if compiled is None else compiled.isa(),
     }
+
+
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

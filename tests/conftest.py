@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tiny import make_sphere_octree, write_scene
 
-from nerfvol.octree import Octree
+from nerfvol.octree.tree import Octree
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -25,7 +25,7 @@ def sphere_octree() -> Octree:
 @pytest.fixture
 def command(capsys):
     """Run the command line in this process: command("eval", ...) -> (exit code, stdout, stderr)."""
-    from nerfvol.cli import main
+    from nerfvol.cli.main import main
 
     def run(*arguments):
         code = main([str(argument) for argument in arguments])

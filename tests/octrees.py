@@ -5,8 +5,8 @@ from hypothesis import given as hypothesis_given
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from nerfvol.octree import Octree
-from nerfvol.topology import OFFSETS
+from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.tree import Octree
 
 # Dyadic, so that positions of lattice points are exact and can be compared with ==.
 ORIGIN, SIZE = (-1.5, 0.25, -4.0), 2.0

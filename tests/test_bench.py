@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from tiny import make_sphere_octree
 
-from nerfvol import bench, roofline
-from nerfvol.camera_paths import default_orbit, orbit_cameras
-from nerfvol.octree_io import save_octree
+from nerfvol.cameras.paths import default_orbit, orbit_cameras
+from nerfvol.measure import bench, roofline
+from nerfvol.octree.io import save_octree
 
 
 @pytest.fixture

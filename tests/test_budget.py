@@ -7,10 +7,12 @@ import time
 import pytest
 from tiny_runs import TINY, Pretended, log_of, settings, start
 
-from nerfvol import cli, runs, session, trainer
-from nerfvol.memory import estimate_training, octree_bytes
-from nerfvol.octree_io import load_octree
-from nerfvol.trainer import OctreePhase
+from nerfvol.cli import main
+from nerfvol.files import run_folder
+from nerfvol.octree.io import load_octree
+from nerfvol.training import session, train
+from nerfvol.training.memory import estimate_training, octree_bytes
+from nerfvol.training.train import OctreePhase
 
 
 @pytest.mark.parametrize("init", ["direct", "mlp"])
@@ -22,7 +24,7 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     config = settings(tiny_scene, tmp_path, init=init, time_budget=10.0, checkpoint_every=1000)
     config.octree.steps = config.field.steps = 10**9
     start(config)
-    metrics = json.loads((tmp_path / runs.METRICS).read_text())
+    metrics = json.loads((tmp_path / run_folder.METRICS).read_text())
     log = log_of(tmp_path)
     assert metrics["psnr"] > 12 and metrics["time_budget"] == 10
     assert log[-1]["phase"] == "octree" and log[-1]["progress"] >= 1 and log[-1]["stage"] == 2
@@ -73,7 +75,7 @@ def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
 
     monkeypatch.setattr(session, "HELD_OUT_KEPT", 0)
     monkeypatch.setattr(session.time, "perf_counter", look)
-    cli.set_threads(1)
+    main.set_threads(1)
     run = session.Run(settings(tiny_scene, tmp_path, time_budget=1000.0), session.Clock(0.0, 0.0), None)
     assert "images" not in vars(run.held_out) and len(run.comparison_views) == 2
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0)
@@ -120,8 +122,8 @@ def test_a_budget_is_kept(tmp_path, tiny_scene):
 
 def test_a_budget_that_is_over_before_the_start(tmp_path, tiny_scene):
     start(settings(tiny_scene, tmp_path, time_budget=1.0), started=time.perf_counter() - 10)
-    assert json.loads((tmp_path / runs.METRICS).read_text())["steps"] == {"octree": 0}
-    assert load_octree(tmp_path / runs.OCTREE)[0].n_leaves > 0
+    assert json.loads((tmp_path / run_folder.METRICS).read_text())["steps"] == {"octree": 0}
+    assert load_octree(tmp_path / run_folder.OCTREE)[0].n_leaves > 0
 
 
 def test_the_time_of_earlier_sessions_counts(tmp_path, tiny_scene):
@@ -135,6 +137,6 @@ def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
     run = session.Run(settings(tiny_scene, tmp_path, time_budget=100.0), session.Clock(0.0, 0.0), None)
     assert run.rich_tiles == pytest.approx(300 * run._beside.rich_share) and 100 < run.rich_tiles <= 300
     drawn = run.config.octree.tiles[-1] * run.config.octree.rich_share
-    for epochs, steps in [(1e4, 1e4 * run.rich_tiles / drawn), (1.0, trainer.FEWEST_STEPS)]:
+    for epochs, steps in [(1e4, 1e4 * run.rich_tiles / drawn), (1.0, train.FEWEST_STEPS)]:
         run.config.octree.most_epochs = epochs
         assert OctreePhase(run, None).most_steps == pytest.approx(steps)

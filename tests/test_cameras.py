@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerfvol.cameras import Camera, Intrinsics, _DirectionCache, look_at, orbit, rigid_pose, tile_pixels
+from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, rigid_pose, tile_pixels
+from nerfvol.cameras.lens import distort, undistort
 from nerfvol.errors import InputError
-from nerfvol.lens import distort, undistort
 
 EPS32, EPS64 = 2.0**-23, 2.0**-52
 PINHOLE = Intrinsics(61, 47, 70.0, 72.0, 29.5, 24.25)
@@ -150,8 +150,12 @@ def test_fisheye_angles():
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.floats(-0.4, 0.4), min_size=4, max_size=4), st.lists(st.floats(-0.03, 0.03), min_size=2, max_size=2),
-       st.booleans(), st.floats(0.1, 1.2))
+@given(
+    st.lists(st.floats(-0.4, 0.4), min_size=4, max_size=4),
+    st.lists(st.floats(-0.03, 0.03), min_size=2, max_size=2),
+    st.booleans(),
+    st.floats(0.1, 1.2),
+)
 def test_distortion_round_trip_or_a_clear_refusal(radial, tangential, fisheye, reach):
     coefficients = (*radial, *([0.0, 0.0] if fisheye else tangential))
     steps = np.linspace(-reach, reach, 9)
@@ -183,9 +187,7 @@ def test_scaled_cameras_look_through_the_middle_of_their_blocks(lens, k):
     scaled = full.scaled(k)
     assert (scaled.width, scaled.height) == (full.width // k, full.height // k)
     middles = k * pixel_centres(scaled)
-    np.testing.assert_allclose(
-        scaled.directions().reshape(-1, 3), full.directions_at(middles), rtol=0, atol=EPS32
-    )
+    np.testing.assert_allclose(scaled.directions().reshape(-1, 3), full.directions_at(middles), rtol=0, atol=EPS32)
 
 
 def test_resized_keeps_the_field_of_view_across():

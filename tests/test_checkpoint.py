@@ -11,9 +11,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nerfvol.arrayfile import ArrayFile, write_arrays
-from nerfvol.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.errors import InputError
+from nerfvol.files.arrayfile import ArrayFile, write_arrays
+from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 
 SETTINGS = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -57,9 +57,7 @@ def test_round_trip(tmp_path):
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
 keys = st.text() | st.integers()
-trees = st.recursive(
-    scalars, lambda t: st.lists(t, max_size=4) | st.dictionaries(keys, t, max_size=4), max_leaves=15
-)
+trees = st.recursive(scalars, lambda t: st.lists(t, max_size=4) | st.dictionaries(keys, t, max_size=4), max_leaves=15)
 
 
 @SETTINGS

@@ -12,9 +12,12 @@ import pytest
 from tiny import make_sphere_octree, write_scene
 
 import nerfvol
-from nerfvol import cli, runs
+from nerfvol.cli import main
+from nerfvol.config.assemble import run_settings
+from nerfvol.config.training import Config
 from nerfvol.errors import InputError
-from nerfvol.octree_io import save_octree
+from nerfvol.octree.io import save_octree
+from nerfvol.training.prepare import prepare_run
 
 ROOT = Path(nerfvol.__file__).parents[1]
 
@@ -34,7 +37,7 @@ def test_help_is_instant_and_imports_nothing_heavy():
     for word in ("train", "eval", "render", "info", "synth", "bench"):
         assert word in done.stdout
     assert seconds < 2.0  # 0.1 s on a free machine; torch alone takes more than this bound on a busy one
-    code = "import sys; from nerfvol import cli; cli.main(['train', '--help']); print(*sys.modules)"
+    code = "import sys; from nerfvol.cli import main; main.main(['train', '--help']); print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout.split()
     assert not {"torch", "numpy", "numba", "imageio"} & set(modules)
 
@@ -104,7 +107,7 @@ def test_endings(raised, code, text, capfd):
     def fail():
         raise raised
 
-    assert cli.guard(fail) == code
+    assert main.guard(fail) == code
     assert text in capfd.readouterr().err
 
 
@@ -113,7 +116,7 @@ def test_defects_keep_their_traceback():
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        cli.guard(fail)
+        main.guard(fail)
 
 
 def test_the_packages_share_one_kind_of_sentence(command):
@@ -144,18 +147,18 @@ def test_info(tmp_path, command):
 
 
 def test_an_earlier_run_is_put_aside_once(tmp_path):
-    config = runs.Config(data=".", out=str(tmp_path / "run"), field=None, octree=None)
-    runs.prepare(config)
+    config = Config(data=".", out=str(tmp_path / "run"), field=None, octree=None)
+    prepare_run(config)
     assert not (tmp_path / "run" / "previous").exists()
     for text in ("first", "second"):
         (tmp_path / "run" / "octree.safetensors").write_text(text)
         (tmp_path / "run" / "metrics.json").write_text(text)
-        runs.prepare(config)
+        prepare_run(config)
         assert (tmp_path / "run" / "previous" / "octree.safetensors").read_text() == text
         assert not (tmp_path / "run" / "octree.safetensors").exists()
     config.resume = True
     (tmp_path / "run" / "octree.safetensors").write_text("third")
-    runs.prepare(config)
+    prepare_run(config)
     assert (tmp_path / "run" / "octree.safetensors").read_text() == "third"
 
 
@@ -166,8 +169,8 @@ def test_threads_are_set_everywhere():
 
     before = ops.get_threads()
     try:
-        assert cli.set_threads(1) == 1 and ops.get_threads() == 1 and torch.get_num_threads() == 1
-        assert cli.set_threads(0) == len(os.sched_getaffinity(0)) == ops.get_threads()
+        assert main.set_threads(1) == 1 and ops.get_threads() == 1 and torch.get_num_threads() == 1
+        assert main.set_threads(0) == len(os.sched_getaffinity(0)) == ops.get_threads()
     finally:
         ops.set_threads(before)
 
@@ -199,7 +202,7 @@ def trained(tmp_path_factory, tiny_scene):
 def test_train_leaves_a_whole_run_folder(trained):
     names = {path.name for path in trained.iterdir()}
     assert {"config.yaml", "octree.safetensors", "checkpoint.safetensors", "metrics.json", "log.jsonl"} <= names
-    assert runs.run_settings(trained)["seed"] == 3 and runs.run_settings(trained)["octree"]["steps"] == 300
+    assert run_settings(trained)["seed"] == 3 and run_settings(trained)["octree"]["steps"] == 300
     for line in (trained / "log.jsonl").read_text().splitlines():
         json.loads(line)
     json.loads((trained / "metrics.json").read_text())
@@ -220,7 +223,8 @@ def test_train_eval_render_end_to_end(tmp_path, trained, command):
 
 
 def test_config_of_a_run_reproduces_it_as_a_file(tmp_path, trained):
-    from nerfvol.config import Config, assemble, read_yaml, to_plain
+    from nerfvol.config.assemble import assemble, read_yaml, to_plain
+    from nerfvol.config.training import Config
 
     settings = read_yaml(trained / "config.yaml")
     assert to_plain(assemble(Config, (settings, "config.yaml"))) == settings
@@ -238,7 +242,7 @@ def test_bad_data(tmp_path, command, what):
     elif what == "truncated image":
         image.write_bytes(image.read_bytes()[:60])
     elif what == "transparent":
-        from nerfvol.pictures import write_png
+        from nerfvol.files.pictures import write_png
 
         for path in (scene / "train").iterdir():
             write_png(path, np.zeros((24, 24, 4)))

@@ -7,18 +7,8 @@ from typing import Annotated, Literal
 
 import pytest
 
-from nerfvol.config import (
-    Colour,
-    Count,
-    assemble,
-    colour,
-    parse_assignment,
-    positive,
-    read_yaml,
-    seconds,
-    to_plain,
-    write_yaml,
-)
+from nerfvol.config.assemble import assemble, parse_assignment, read_yaml, write_yaml
+from nerfvol.config.values import Colour, Count, colour, positive, seconds
 from nerfvol.errors import InputError
 
 
@@ -34,7 +24,6 @@ class Section:
     levels: int = 3
     widths: tuple[int, ...] = (4, 8)
     aabb: tuple[float, float, float] | None = None
-    stages: tuple[Stage, ...] = (Stage(),)
     weights: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
@@ -78,7 +67,6 @@ def test_every_kind_of_value():
             "names": ["a", "b"],
             "section": {
                 "rate": "1e-3", "widths": [1, 2, 3], "aabb": [0, 1, 2], "weights": {"tv": 1},
-                "stages": [{"resolution": 32}, {"until": 0.5}],
             },
         }
     )  # fmt: skip
@@ -86,7 +74,7 @@ def test_every_kind_of_value():
     assert settings.resume is True and settings.folder == Path("/tmp") and settings.names == ["a", "b"]
     section = settings.section
     assert section.rate == 1e-3 and section.widths == (1, 2, 3) and section.aabb == (0.0, 1.0, 2.0)
-    assert section.stages == (Stage(32), Stage(until=0.5)) and section.weights == {"tv": 1.0}
+    assert section.weights == {"tv": 1.0}
     assert isinstance(section.aabb[0], float)
 
 
@@ -95,7 +83,7 @@ def test_every_kind_of_value():
     [
         ({"backgroud": "white"}, "a.yaml: unknown key 'backgroud'; did you mean 'background'?"),
         ({"section": {"level": 1}}, "a.yaml: unknown key 'section.level'; did you mean 'section.levels'?"),
-        ({"section": {"stages": [{"resolutoin": 1}]}}, "unknown key 'resolutoin'; did you mean 'resolution'?"),
+        ({"stage": {"resolutoin": 1}}, "unknown key 'stage.resolutoin'; did you mean 'stage.resolution'?"),
         ({"section": 3}, "a.yaml: section is a section, expected keys and values, got 3"),
         ({"section": None}, "section is a section"),
         ({"mode": "nerf"}, "a.yaml: mode: expected mlp or direct, got 'nerf'"),
@@ -151,11 +139,10 @@ def test_colour_and_positive():
 
 
 def test_written_file_reads_back_the_same(tmp_path):
-    section = {"stages": [{"until": 0.25}], "aabb": [1, 2, 3]}
+    section = {"aabb": [1, 2, 3]}
     settings = build({"background": "black", "section": section, "data": "é x"})
     write_yaml(tmp_path / "config.yaml", settings)
     assert assemble(Settings, (read_yaml(tmp_path / "config.yaml"), "file")) == settings
-    assert to_plain(settings)["section"]["stages"] == [{"resolution": 64, "until": 0.25}]
 
 
 @pytest.mark.parametrize(

@@ -8,22 +8,17 @@ import pytest
 import torch
 
 from nerfvol import sh as spherical
-from nerfvol.cameras import Camera, Intrinsics, orbit
-from nerfvol.datasets import Dataset, SceneBounds
-from nerfvol.distill import (
-    DistillConfig,
-    Frame,
-    candidate_cells,
-    dilated,
-    distill,
-    largest_sigma,
-    largest_weights,
-    write_values,
-)
+from nerfvol.cameras.camera import Camera, Intrinsics, orbit
+from nerfvol.config.training import DistillConfig
+from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain
-from nerfvol.merge import merge_smooth
-from nerfvol.octree import OFFSETS, Octree, explin
+from nerfvol.field.fields import Domain
+from nerfvol.octree.merge import merge_smooth
+from nerfvol.octree.rows import explin
+from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.tree import Octree
+from nerfvol.region import SceneBounds
+from nerfvol.starts.field import Frame, candidate_cells, dilated, distill, largest_sigma, largest_weights, write_values
 
 DOMAIN = Domain((0.1, -0.2, 0.3), 1.0)
 CENTER = torch.tensor(DOMAIN.center)
@@ -205,7 +200,9 @@ def test_a_field_that_does_not_fit_keeps_its_densest_cells() -> None:
         Blob(), Frame.of(DOMAIN, 5), DistillConfig(level=5, coarse_level=3, max_leaves=100), messages
     )
     assert 8 <= len(ijk) <= 100 and (level == 3).all()
-    assert len(messages) == 2 and "only what is more opaque than" in messages[1] and "fits into 100 leaves" in messages[1]
+    assert (
+        len(messages) == 2 and "only what is more opaque than" in messages[1] and "fits into 100 leaves" in messages[1]
+    )
     middle = np.array(list(np.ndindex(2, 2, 2))) + 3
     assert {tuple(cell) for cell in middle.tolist()} <= {tuple(cell) for cell in ijk.tolist()}
 
@@ -387,6 +384,8 @@ def test_values_do_not_depend_on_the_parts(monkeypatch, samples) -> None:
     """Vertices are filled a part at a time, to spare memory; each alone. Sums are of float64 products either way."""
     whole, parts = (full_octree(3).subdivide(np.arange(512) % 3 == 0)[0] for _ in range(2))
     write_values(whole, Blob(), samples)
-    monkeypatch.setattr("nerfvol.distill._CHUNK", 100)  # of the vertices of two sizes of leaves; the last part is shorter
+    monkeypatch.setattr(
+        "nerfvol.starts.field._CHUNK", 100
+    )  # of the vertices of two sizes of leaves; the last part is shorter
     write_values(parts, Blob(), samples)
     np.testing.assert_allclose(parts.values, whole.values, rtol=1e-6, atol=1e-6)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nerfvol.encodings import FrequencyEncoding, HashGrid
+from nerfvol.field.encodings import FrequencyEncoding, HashGrid
 
 
 def test_frequencies_are_those_of_the_paper() -> None:

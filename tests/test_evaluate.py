@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from tiny import make_sphere_octree
 
-from nerfvol.datasets import load_dataset
-from nerfvol.evaluate import LARGEST_PSNR, evaluate_octree, score_views
-from nerfvol.octree_io import save_octree
+from nerfvol.datasets.load import load_dataset
+from nerfvol.measure.scores import LARGEST_PSNR, evaluate_octree, score_views
+from nerfvol.octree.io import save_octree
 
 
 @pytest.fixture(scope="module")

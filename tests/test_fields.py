@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from nerfvol import sh as spherical
+from nerfvol.config.training import FieldShape
 from nerfvol.errors import InputError
-from nerfvol.fields import (
+from nerfvol.field.fields import (
     ROWS,
     Domain,
-    FieldShape,
     HashField,
     MLPField,
     NeuralField,

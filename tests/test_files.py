@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from nerfvol import files
 from nerfvol.errors import InputError
+from nerfvol.files import atomic
 
 
 def test_success_replaces_and_leaves_no_temporary(tmp_path):
     target = tmp_path / "a.png"
     target.write_bytes(b"old")
-    with files.atomic_write(target) as temporary:
+    with atomic.atomic_write(target) as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".png"
         temporary.write_bytes(b"new")
         assert target.read_bytes() == b"old"  # readers see the old file until the rename
@@ -29,7 +29,7 @@ def test_full_disk_keeps_the_old_file(tmp_path, number):
     target = tmp_path / "a.bin"
     target.write_bytes(b"old")
     with pytest.raises(InputError, match=r"cannot write .*a\.bin: (no space|the disk quota)"):
-        with files.atomic_write(target) as temporary:
+        with atomic.atomic_write(target) as temporary:
             temporary.write_bytes(b"half")
             raise OSError(number, os.strerror(number))
     assert target.read_bytes() == b"old"
@@ -38,7 +38,7 @@ def test_full_disk_keeps_the_old_file(tmp_path, number):
 
 def test_other_exceptions_pass_and_clean_up(tmp_path):
     with pytest.raises(KeyboardInterrupt):
-        with files.atomic_write(tmp_path / "a.bin") as temporary:
+        with atomic.atomic_write(tmp_path / "a.bin") as temporary:
             temporary.write_bytes(b"half")
             raise KeyboardInterrupt
     assert os.listdir(tmp_path) == []
@@ -46,7 +46,7 @@ def test_other_exceptions_pass_and_clean_up(tmp_path):
 
 def test_error_about_another_file_keeps_its_own_name(tmp_path):
     with pytest.raises(FileNotFoundError, match="elsewhere"):
-        with files.atomic_write(tmp_path / "a.bin"):
+        with atomic.atomic_write(tmp_path / "a.bin"):
             open(tmp_path / "elsewhere").close()
 
 
@@ -61,18 +61,18 @@ def test_error_about_another_file_keeps_its_own_name(tmp_path):
 def test_impossible_targets(tmp_path, make, reason):
     target = make(tmp_path)
     with pytest.raises(InputError, match=reason):
-        files.write_bytes(target, b"x")
+        atomic.write_bytes(target, b"x")
 
 
 def test_killed_writer_leaves_the_old_file(tmp_path):
     target = tmp_path / "a.bin"
     target.write_bytes(b"old")
     code = (
-        "import os, signal, sys; from nerfvol import files\n"
-        "with files.atomic_write(sys.argv[1]) as t:\n"
+        "import os, signal, sys; from nerfvol.files import atomic\n"
+        "with atomic.atomic_write(sys.argv[1]) as t:\n"
         "    t.write_bytes(b'half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
-    root = Path(files.__file__).parents[1]
+    root = Path(atomic.__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", code, str(target)], cwd=root)
     assert done.returncode != 0
     assert target.read_bytes() == b"old"
@@ -84,15 +84,15 @@ def test_synced_before_it_is_renamed(tmp_path, monkeypatch):
     sync, replace = os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda fd: order.append("sync") or sync(fd))
     monkeypatch.setattr(os, "replace", lambda a, b: order.append("rename") or replace(a, b))
-    files.write_bytes(tmp_path / "a.bin", b"x")
+    atomic.write_bytes(tmp_path / "a.bin", b"x")
     assert order == ["sync", "rename", "sync"]  # the data, the name, the folder that holds the name
 
 
 def test_json_round_trip_and_nan_refused(tmp_path):
-    files.write_json(tmp_path / "a.json", {"psnr": 30.5, "rows": [1, 2]})
-    assert files.read_json(tmp_path / "a.json") == {"psnr": 30.5, "rows": [1, 2]}
+    atomic.write_json(tmp_path / "a.json", {"psnr": 30.5, "rows": [1, 2]})
+    assert atomic.read_json(tmp_path / "a.json") == {"psnr": 30.5, "rows": [1, 2]}
     with pytest.raises(ValueError):
-        files.write_json(tmp_path / "a.json", {"psnr": float("nan")})
+        atomic.write_json(tmp_path / "a.json", {"psnr": float("nan")})
     assert json.loads((tmp_path / "a.json").read_text())["psnr"] == 30.5
 
 
@@ -103,27 +103,27 @@ def test_bad_json(tmp_path, content, reason):
     path = tmp_path / "a.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=reason) as error:
-        files.read_json(path)
+        atomic.read_json(path)
     assert "a.json" in str(error.value)
 
 
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match="no such file.*nothing.json"):
-        files.read_json(tmp_path / "nothing.json")
+        atomic.read_json(tmp_path / "nothing.json")
 
 
 def test_ensure_writable_folder(tmp_path, monkeypatch):
-    assert files.ensure_writable_folder(tmp_path / "a" / "b").is_dir()
+    assert atomic.ensure_writable_folder(tmp_path / "a" / "b").is_dir()
     assert os.listdir(tmp_path / "a" / "b") == []
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file, not a folder"):
-        files.ensure_writable_folder(tmp_path / "file")
+        atomic.ensure_writable_folder(tmp_path / "file")
     with pytest.raises(InputError, match="not a folder"):
-        files.ensure_writable_folder(tmp_path / "file" / "below")
+        atomic.ensure_writable_folder(tmp_path / "file" / "below")
 
     def refuse(self, data):
         raise PermissionError(errno.EACCES, "Permission denied", str(self))
 
     monkeypatch.setattr(Path, "write_bytes", refuse)
     with pytest.raises(InputError, match="cannot write into .*permission denied"):
-        files.ensure_writable_folder(tmp_path / "a")
+        atomic.ensure_writable_folder(tmp_path / "a")

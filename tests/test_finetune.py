@@ -6,14 +6,16 @@ import weakref
 import numpy as np
 import pytest
 
-from nerfvol.datasets import Dataset, load_dataset
+from nerfvol.config.training import OCTREE_RANGES, OctreeConfig
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
-from nerfvol.finetune import OctreeTrainer
 from nerfvol.kernels import ops
-from nerfvol.octree import DENSITY_SLOT, Octree
-from nerfvol.render import render_image
-from nerfvol.settings import OCTREE_RANGES, OctreeConfig
-from nerfvol.topology import MAX_LEVEL
+from nerfvol.octree.rows import DENSITY_SLOT
+from nerfvol.octree.topology import MAX_LEVEL
+from nerfvol.octree.tree import Octree
+from nerfvol.training.octree_trainer import OctreeTrainer
+from nerfvol.views import render_image
 
 
 def test_nothing_is_pruned_before_it_could_become_visible(tiny_scene):

@@ -5,12 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from nerfvol import lod, native
-from nerfvol.cameras import Camera, Intrinsics, look_at
+from nerfvol import native
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.kernels import ops
-from nerfvol.octree import DENSITY_SLOT, OFFSETS, Octree, explin, explin_inverse
-from nerfvol.render import render_image
-from nerfvol.topology import level_starts, place_nodes
+from nerfvol.kernels.state import OUTPUTS
+from nerfvol.octree import lod
+from nerfvol.octree.rows import DENSITY_SLOT, explin, explin_inverse
+from nerfvol.octree.topology import OFFSETS, level_starts, place_nodes
+from nerfvol.octree.tree import Octree
+from nerfvol.views import render_image
 from tests.kernels.trees import camera_tiles, random_octree
 
 
@@ -165,7 +168,7 @@ def test_the_walk_draws_the_cut_octree(kind, coarse):
         nodes = lod.standing_in(octree, origin, coarse)
         stood_in += nodes.sum()
         image, expected = ops.render_rays(octree, *rays, coarse=coarse), ops.render_rays(lod.cut(octree, nodes), *rays)
-        for name in ops.OUTPUTS:
+        for name in OUTPUTS:
             assert np.array_equal(image[name], expected[name]), name
     assert stood_in > 0 or kind in ("single", "sparse") or coarse < 0.5
 
@@ -178,7 +181,7 @@ def test_the_reference_draws_the_same(monkeypatch):
     assert not np.array_equal(compiled["rgb"], ops.render_rays(octree, o, d, early_stop_eps=0.0)["rgb"])
     monkeypatch.setattr(ops, "native", lambda: None)
     plain = ops.render_rays(octree, o, d, early_stop_eps=0.0, coarse=0.15)
-    for name in ops.OUTPUTS:  # sums over at most some 20 cells of values of order 3, places in small cells off by 1e-5
+    for name in OUTPUTS:  # sums over at most some 20 cells of values of order 3, places in small cells off by 1e-5
         np.testing.assert_allclose(compiled[name], plain[name], rtol=0, atol=2e-4, err_msg=name)
 
 
@@ -205,7 +208,7 @@ def test_without_small_nodes_every_bit_is_that_of_the_leaves(sphere_octree):
     exact = render_image(sphere_octree, camera, lod=0.0)
     assert lod.may_stand_in(sphere_octree, camera.position, 0.999 * smallest / camera.intrinsics.fx)
     below, above = (render_image(sphere_octree, camera, lod=factor * smallest) for factor in (0.999, 1.2))
-    for name in ops.OUTPUTS:
+    for name in OUTPUTS:
         assert np.array_equal(below[name], exact[name]), name
     assert not np.array_equal(above["rgb"], exact["rgb"])
 

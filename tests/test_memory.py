@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from tiny import make_sphere_octree
 
-from nerfvol import memory
-from nerfvol.datasets import load_dataset
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
-from nerfvol.memory import (
+from nerfvol.training import memory
+from nerfvol.training.memory import (
     Beside,
     affordable_leaves,
     estimate_training,

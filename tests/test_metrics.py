@@ -8,7 +8,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from nerfvol.errors import InputError
-from nerfvol.metrics import psnr, ssim
+from nerfvol.measure.metrics import psnr, ssim
 
 
 def pictures(kind, seed=0, shape=(70, 83, 3)):

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from nerfvol.errors import InputError
-from nerfvol.fields import Domain
-from nerfvol.occupancy import OccupancyGrid, OccupiedField, StepSchedule
-from nerfvol.sampling import intersect_aabb, step_generator
+from nerfvol.field.fields import Domain
+from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, StepSchedule
+from nerfvol.field.sampling import intersect_aabb, step_generator
 
 BOUNDED = Domain((0.2, -0.3, 0.1), 1.5)
 PHOTO = Domain((0.2, -0.3, 0.1), 1.5, outer=8.0)

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import strategies as st
 from octrees import ORIGIN, SIZE, given, octrees
 
-import nerfvol.topology as module
+import nerfvol.octree.topology as module
 from nerfvol.errors import InputError
 from nerfvol.native import aligned_empty
-from nerfvol.octree import Octree
-from nerfvol.topology import MAX_LEVEL
+from nerfvol.octree.topology import MAX_LEVEL
+from nerfvol.octree.tree import Octree
 
 
 # ------------------------------------------------------------------ refusals

@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 
-from nerfvol import octree_codec, octree_io
 from nerfvol.errors import InputError
-from nerfvol.octree import Octree
-from nerfvol.octree_io import describe_octree, load_octree, save_octree
-from nerfvol.topology import morton
+from nerfvol.octree import codec, io
+from nerfvol.octree.io import describe_octree, load_octree, save_octree
+from nerfvol.octree.topology import morton
+from nerfvol.octree.tree import Octree
 
 BYTE = st.integers(0, 255)
 SETTINGS = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -68,15 +68,15 @@ def test_float16_is_rounded_once(tmp_path):
 def test_codec_keeps_its_error_bounds(degree, quality):
     octree = make_octree(degree + 10, degree)
     density, sh = octree.density.copy(), octree.sh
-    planes, parameters = octree_codec.encode(density, sh, quality)
+    planes, parameters = codec.encode(density, sh, quality)
     parameters = json.loads(json.dumps(parameters))
-    found_density, found_sh = octree_codec.decode(len(density), sh.shape[2], planes.__getitem__, parameters)
+    found_density, found_sh = codec.decode(len(density), sh.shape[2], planes.__getitem__, parameters)
     # Rounding moves the companded density by at most half a step; float32 adds its own rounding, some 1e-6 of asinh.
-    curve = np.arcsinh(np.float64(density) / octree_codec.DENSITY_SOFTNESS)
-    moved = np.abs(np.arcsinh(np.float64(found_density) / octree_codec.DENSITY_SOFTNESS) - curve)
-    assert moved.max() <= 0.5 * octree_codec.DENSITY_STEP / quality + 1e-5
+    curve = np.arcsinh(np.float64(density) / codec.DENSITY_SOFTNESS)
+    moved = np.abs(np.arcsinh(np.float64(found_density) / codec.DENSITY_SOFTNESS) - curve)
+    assert moved.max() <= 0.5 * codec.DENSITY_STEP / quality + 1e-5
     # An orthonormal rotation of three errors of half a step each is at most sqrt(3) / 2 steps long.
-    step = octree_codec.COLOUR_STEP / 0.28209479177387814 / quality
+    step = codec.COLOUR_STEP / 0.28209479177387814 / quality
     distance = np.linalg.norm(found_sh - sh, axis=1)
     assert distance.max() <= 0.5 * 3**0.5 * step + 1e-5
     # Uniform rounding errors have variance step^2 / 12: the whole range of steps is used, none twice as coarse.
@@ -101,17 +101,17 @@ def test_smooth_values_store_differences(tmp_path):
     sh = np.zeros((octree.n_vertices, 3, 4), np.float32)
     sh[:, :, 0] = np.cos(position)
     octree.sh = sh
-    planes, parameters = octree_codec.encode(octree.density, octree.sh)
+    planes, parameters = codec.encode(octree.density, octree.sh)
     assert parameters["differences"][1] and not parameters["differences"][2]
-    density, found = octree_codec.decode(octree.n_vertices, 4, planes.__getitem__, parameters)
+    density, found = codec.decode(octree.n_vertices, 4, planes.__getitem__, parameters)
     assert np.abs(found - octree.sh).max() < 0.06
     moved = np.abs(np.arcsinh(density / 2) - np.arcsinh(octree.density / 2))
-    assert moved.max() < 0.5 * octree_codec.DENSITY_STEP + 1e-5
+    assert moved.max() < 0.5 * codec.DENSITY_STEP + 1e-5
 
 
 def test_values_at_the_bounds_survive(tmp_path):
     octree = make_octree()
-    for value in (octree_io.LARGEST_VALUE, -octree_io.LARGEST_VALUE, 0.0):
+    for value in (io.LARGEST_VALUE, -io.LARGEST_VALUE, 0.0):
         octree.density = value
         save_octree(tmp_path / "o.safetensors", octree, {}, "compact")
         loaded, _ = load_octree(tmp_path / "o.safetensors")
@@ -296,7 +296,7 @@ def test_a_declared_count_costs_no_memory(tmp_path, monkeypatch):
     """A count that the masks cannot have is refused before the octree is built."""
     path = tmp_path / "bad.safetensors"
     edited(path, "compact", document={"n_vertices": 10**9})
-    monkeypatch.setattr(octree_io, "Octree", None)
+    monkeypatch.setattr(io, "Octree", None)
     with pytest.raises(InputError, match="declares 1000000000 vertices"):
         load_octree(path)
 

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from nerfvol import plots
 from nerfvol.errors import InputError
+from nerfvol.measure import plots
 
 RATES = ("frames_per_second", "train_rays_per_second")
 

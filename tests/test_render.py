@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 
 from data_synth.image import read_exr
-from nerfvol import pictures, render
-from nerfvol.camera_paths import cameras_document, default_orbit, describe_orbit, load_cameras, orbit_cameras
-from nerfvol.cameras import Camera, Intrinsics, look_at, orbit
+from nerfvol import views
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at, orbit
+from nerfvol.cameras.paths import cameras_document, default_orbit, describe_orbit, load_cameras, orbit_cameras
 from nerfvol.errors import InputError
+from nerfvol.files import pictures
 from nerfvol.kernels import ops
-from nerfvol.octree import Octree
-from nerfvol.octree_io import save_octree
+from nerfvol.kernels.state import OUTPUTS
+from nerfvol.octree.io import save_octree
+from nerfvol.octree.tree import Octree
 
 
 def lens_of(width, height, focal=None):
@@ -37,12 +39,12 @@ def test_every_pixel_is_its_own_ray(sphere_octree, monkeypatch, size, path):
     with monkeypatch.context() as patch:
         if path == "reference":
             patch.setattr(ops, "native", lambda: None)
-        image = render.render_image(sphere_octree, camera, (0.2, 0.4, 0.6), 0.0, lod=0.0)
+        image = views.render_image(sphere_octree, camera, (0.2, 0.4, 0.6), 0.0, lod=0.0)
     origin, directions = camera.rays()
     expected = ops.render_rays(
         sphere_octree, np.broadcast_to(origin, directions.shape).copy(), directions, (0.2, 0.4, 0.6), 0.0
     )
-    assert set(image) == set(ops.OUTPUTS)
+    assert set(image) == set(OUTPUTS)
     for name, value in image.items():
         want = expected[name].reshape(value.shape)
         # float32 sums over at most some 30 leaves of values of order 1 (distances: of order 3)
@@ -62,12 +64,12 @@ def wall():
 def test_known_geometry_of_a_wall():
     """A camera 2 above the cube's upper face: sizes, distances and colours follow from similar triangles."""
     camera = Camera(lens_of(64, 64, focal=96.0), look_at((0, 0, 3.0), (0, 0, 0), up=(0, 1, 0)))
-    image = render.render_image(wall(), camera, (1, 1, 1), 0.0)
+    image = views.render_image(wall(), camera, (1, 1, 1), 0.0)
     # The face at distance 2 spans 1 / 2 * 96 = 48 pixels: 8 to 56, to the pixel.
     inside = np.zeros((64, 64), bool)
     inside[8:56, 8:56] = True
     assert np.array_equal(image["opacity"] > 0.5, inside)
-    depth = render.surface_depth(image)
+    depth = views.surface_depth(image)
     i, j = np.meshgrid(np.arange(64), np.arange(64))
     slant = np.sqrt(1 + ((i + 0.5 - 32) / 96) ** 2 + ((j + 0.5 - 32) / 96) ** 2)
     # One midpoint sample a leaf of size 1/8: the mean distance is at most a leaf's half diagonal behind the face.
@@ -80,19 +82,19 @@ def test_known_geometry_of_a_wall():
 def test_picture_is_not_mirrored(sphere_octree):
     """x to the right, y up: the sphere's colour 0.5 + 0.4 sin(3 p) seen from +z with y up."""
     camera = Camera(lens_of(41, 41), look_at((0, 0, 3.0), (0, 0, 0), up=(0, 1, 0)))
-    rgb = render.render_image(sphere_octree, camera)["rgb"]
+    rgb = views.render_image(sphere_octree, camera)["rgb"]
     assert rgb[20, 28, 0] > 0.6 > 0.4 > rgb[20, 12, 0]  # red grows with x
     assert rgb[12, 20, 1] > 0.6 > 0.4 > rgb[28, 20, 1]  # green grows with y
 
 
 def test_only_what_was_asked_for(sphere_octree):
-    assert set(render.render_image(sphere_octree, camera_at(9, 9), outputs=("opacity",))) == {"opacity"}
+    assert set(views.render_image(sphere_octree, camera_at(9, 9), outputs=("opacity",))) == {"opacity"}
 
 
 def test_normals_point_at_the_viewer(sphere_octree):
     camera = Camera(lens_of(41, 41), look_at((0, 0, 3.0), (0, 0, 0), up=(0, 1, 0)))
-    image = render.render_image(sphere_octree, camera)
-    normal = render.unit_normal(image)
+    image = views.render_image(sphere_octree, camera)
+    normal = views.unit_normal(image)
     assert np.dot(normal[20, 20], [0, 0, 1]) > 0.95
     lengths = np.linalg.norm(normal, axis=-1)
     assert np.all((np.abs(lengths - 1) < 1e-4) | (lengths == 0))
@@ -101,14 +103,14 @@ def test_normals_point_at_the_viewer(sphere_octree):
 def test_depth_range_is_that_of_what_is_seen(sphere_octree):
     """The near half of a sphere of radius 0.8 seen from distance 3: 2.2 to sqrt(9 - 0.64)."""
     camera = Camera(lens_of(200, 100), look_at((0, 0, 3.0), (0, 0, 0), up=(0, 1, 0)))
-    near, far = render.depth_range(sphere_octree, [camera])
+    near, far = views.depth_range(sphere_octree, [camera])
     margin = 0.1 * (math.sqrt(8.36) - 2.2)
     assert 2.2 - 1.5 * margin < near < 2.2 and math.sqrt(8.36) - margin < far < math.sqrt(8.36) + 1.5 * margin
 
 
 def test_depth_range_of_nothing_is_that_of_the_cube(sphere_octree):
     camera = Camera(lens_of(20, 20), look_at((0, 0, 3.0), (0, 0, 9.0), up=(0, 1, 0)))
-    near, far = render.depth_range(sphere_octree, [camera])
+    near, far = views.depth_range(sphere_octree, [camera])
     assert near == pytest.approx(3 - 3**0.5) and far == pytest.approx(3 + 3**0.5)
 
 
@@ -333,11 +335,13 @@ def test_render_exr_and_video(tmp_path, octree_file, command):
 @pytest.mark.parametrize("out", ["views", "v.mp4"])
 def test_a_disk_that_takes_no_more(tmp_path, octree_file, out):
     """A limit on file size, set by the operating system as a full disk would be: one sentence, no half files."""
-    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); from nerfvol import cli; "
+    limited = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200)); from nerfvol.cli import main; "
+    )
     arguments = ["render", str(octree_file), "--orbit", "3", "--size", "64x64", "--out", str(tmp_path / out)]
-    root = Path(render.__file__).parents[1]
+    root = Path(views.__file__).parents[1]
     done = subprocess.run(
-        [sys.executable, "-c", limited + f"sys.exit(cli.main({arguments}))"], cwd=root, capture_output=True, text=True
+        [sys.executable, "-c", limited + f"sys.exit(main.main({arguments}))"], cwd=root, capture_output=True, text=True
     )
     assert done.returncode == 2 and done.stderr.startswith("nerfvol: error: cannot write"), done.stderr
     assert done.stderr.count("\n") == 1 and len(done.stderr) < 300 and str(tmp_path / out) in done.stderr

@@ -16,11 +16,14 @@ import pytest
 from tiny_runs import TINY, log_of, metrics_of, product, settings, start
 
 import nerfvol
-from nerfvol import cli, runs, session
-from nerfvol.checkpoint import load_checkpoint, save_checkpoint
-from nerfvol.config import Config, assemble
+from nerfvol.cli import main
+from nerfvol.config.assemble import assemble, run_settings
+from nerfvol.config.training import Config
 from nerfvol.errors import InputError
-from nerfvol.octree_io import load_octree
+from nerfvol.files import run_folder
+from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
+from nerfvol.octree.io import load_octree
+from nerfvol.training import session
 
 ROOT = Path(nerfvol.__file__).parents[1]
 
@@ -42,7 +45,7 @@ def whole(request, tmp_path_factory, tiny_scene) -> Whole:
     def save_and_keep(self, phase):
         save(self, phase)
         kept = folder / f"{phase.name}{phase.steps_done}"
-        shutil.copy(self.folder / runs.CHECKPOINT, kept)
+        shutil.copy(self.folder / run_folder.CHECKPOINT, kept)
         checkpoints[phase.name, phase.steps_done] = kept
 
     with pytest.MonkeyPatch.context() as patch:
@@ -68,8 +71,8 @@ def test_resumed_anywhere_the_octree_is_the_same(whole, tmp_path, tiny_scene):
         phase, step = keys[index]
         out = tmp_path / f"{phase}{step}"
         out.mkdir()
-        shutil.copy(whole.run / runs.CONFIG, out)
-        shutil.copy(whole.checkpoints[phase, step], out / runs.CHECKPOINT)
+        shutil.copy(whole.run / run_folder.CONFIG, out)
+        shutil.copy(whole.checkpoints[phase, step], out / run_folder.CHECKPOINT)
         start(settings(tiny_scene, out, init=init, resume=True, checkpoint_every=1000))
         assert product(out) == product(whole.run), f"resumed at step {step} of the {phase}"
         assert metrics_of(out)["steps"] == metrics_of(whole.run)["steps"]
@@ -77,7 +80,7 @@ def test_resumed_anywhere_the_octree_is_the_same(whole, tmp_path, tiny_scene):
 
 
 def load_config(run: Path) -> dict:
-    return runs.run_settings(run)
+    return run_settings(run)
 
 
 def test_threads_change_nothing(whole, tmp_path, tiny_scene):
@@ -85,14 +88,14 @@ def test_threads_change_nothing(whole, tmp_path, tiny_scene):
     try:
         run = start(settings(tiny_scene, tmp_path / "two", init=init, threads=2, checkpoint_every=1000))
     finally:
-        cli.set_threads(1)
+        main.set_threads(1)
     assert product(run) == product(whole.run)
 
 
 def test_another_seed_changes_something(whole, tmp_path, tiny_scene):
     init = load_config(whole.run)["init"]
     run = start(settings(tiny_scene, tmp_path / "other", init=init, seed=1, checkpoint_every=1000))
-    a, b = load_octree(run / runs.OCTREE)[0], load_octree(whole.run / runs.OCTREE)[0]
+    a, b = load_octree(run / run_folder.OCTREE)[0], load_octree(whole.run / run_folder.OCTREE)[0]
     assert a.values.shape != b.values.shape or not np.array_equal(a.values, b.values)
 
 
@@ -106,31 +109,31 @@ def test_without_a_budget_the_clock_changes_nothing(whole, tmp_path, tiny_scene,
 
 # ---------------------------------------------------------------- what a run leaves
 def test_records(whole, command):
-    metrics = json.loads((whole.run / runs.METRICS).read_text())
+    metrics = json.loads((whole.run / run_folder.METRICS).read_text())
     code, *_ = command("eval", whole.run, "--split", "val", "--threads", 1, "--json", whole.run / "eval.json")
     record = json.loads((whole.run / "eval.json").read_text())
     assert code == 0
     for key in ("psnr", "ssim", "image_size", "background", "n_images", "threads", "hardware", "split"):
         assert metrics[key] == record[key], key
-    assert metrics["leaves"] == load_octree(whole.run / runs.OCTREE)[0].n_leaves
+    assert metrics["leaves"] == load_octree(whole.run / run_folder.OCTREE)[0].n_leaves
     assert metrics["steps"]["octree"] == 60 and metrics["MB"] > 0 and metrics["vertices"] > metrics["leaves"]
     mlp = metrics["init"] == "mlp"
     assert list(metrics["stages"]) == (["field", "distilled", "fine_tuned"] if mlp else [])
     for row in metrics["stages"].values():
         assert {"psnr", "ssim", "seconds", "leaves", "MB", "seconds_per_frame"} <= row.keys()
-    assert (whole.run / runs.DISTILLED).exists() == mlp
-    names = {path.name for path in (whole.run / runs.PREVIEWS).iterdir()}
+    assert (whole.run / run_folder.DISTILLED).exists() == mlp
+    names = {path.name for path in (whole.run / run_folder.PREVIEWS).iterdir()}
     assert {"octree_010.png", "octree_100.png"} <= names and ("field_100.png" in names) == mlp
     assert not [path.name for path in whole.run.iterdir() if ".tmp" in path.name]
-    from nerfvol.render import find_orbit
+    from nerfvol.cli.target import find_orbit
 
-    orbit = find_orbit("nowhere", *load_octree(whole.run / runs.OCTREE))
+    orbit = find_orbit("nowhere", *load_octree(whole.run / run_folder.OCTREE))
     assert orbit["radius"] == pytest.approx(3.2, rel=0.05) and orbit["center"] == pytest.approx([0, 0, 0], abs=0.05)
 
 
 def test_training_gains(whole):
     """The picture is far better than the plain background's; fine-tuning gains on a distilled poor field."""
-    metrics = json.loads((whole.run / runs.METRICS).read_text())
+    metrics = json.loads((whole.run / run_folder.METRICS).read_text())
     if metrics["init"] == "direct":
         assert metrics["psnr"] > 18  # a white picture scores 12
     else:
@@ -148,11 +151,11 @@ def test_a_finished_run_says_so(whole, command):
 def resumed(whole: Whole, out: Path, scene: Path, step: int, change=lambda state: None) -> Path:
     """The run as it goes on in ``out`` from the checkpoint after a step of the octree, which ``change`` may edit."""
     out.mkdir()
-    shutil.copy(whole.run / runs.CONFIG, out)
-    shutil.copy(whole.run / runs.LOG, out)
+    shutil.copy(whole.run / run_folder.CONFIG, out)
+    shutil.copy(whole.run / run_folder.LOG, out)
     state = load_checkpoint(whole.checkpoints["octree", step])
     change(state)
-    save_checkpoint(out / runs.CHECKPOINT, state)
+    save_checkpoint(out / run_folder.CHECKPOINT, state)
     init = load_config(whole.run)["init"]
     return start(settings(scene, out, init=init, resume=True, checkpoint_every=1000))
 
@@ -242,12 +245,12 @@ def test_kill_9_costs_no_file(tmp_path, tiny_scene):
     arguments = ["train", "--out", str(run), "--config", str(tmp_path / "tiny.yaml")]
     process = subprocess.Popen([sys.executable, "-m", "nerfvol.cli", *arguments], cwd=ROOT, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while not (run / runs.LOG).exists() or len((run / runs.LOG).read_text().splitlines()) < 3:
+    while not (run / run_folder.LOG).exists() or len((run / run_folder.LOG).read_text().splitlines()) < 3:
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.002)
     process.kill()
     assert process.wait() == -signal.SIGKILL
-    assert load_checkpoint(run / runs.CHECKPOINT)["phase"] == "octree"
+    assert load_checkpoint(run / run_folder.CHECKPOINT)["phase"] == "octree"
     start(assemble(Config, (plan, "plan"), ({"out": str(run), "resume": True}, "test")))
     start(assemble(Config, (plan, "plan"), ({"out": str(tmp_path / "straight")}, "test")))
     assert product(run) == product(tmp_path / "straight")

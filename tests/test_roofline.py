@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from tiny import make_sphere_octree
 
-from nerfvol import roofline
-from nerfvol.camera_paths import default_orbit, orbit_cameras
-from nerfvol.octree import Octree
-from nerfvol.roofline import Machine, Work
+from nerfvol.cameras.paths import default_orbit, orbit_cameras
+from nerfvol.measure import roofline
+from nerfvol.measure.roofline import Machine, Work
+from nerfvol.octree.tree import Octree
 
 
 def crossings(octree: Octree, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from nerfvol.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
+from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
 
 N = 4000
 

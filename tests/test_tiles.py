@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from nerfvol import tiles
-from nerfvol.cameras import Intrinsics, orbit
-from nerfvol.datasets import Dataset, SceneBounds
-from nerfvol.kernels.ops import TILE
+from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.tiles import Cursor, TileBank
+from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.native import native
-from nerfvol.tiles import Cursor, TileBank
+from nerfvol.region import SceneBounds
+from nerfvol.training import tiles
 
 WHITE = (1.0, 1.0, 1.0)
 SCENE = SceneBounds(np.array([[-1.0, -1, -1], [1, 1, 1]]), None, True)
@@ -45,7 +46,7 @@ def test_each_pixel_stands_once_with_its_own_ray_and_colour(odd, k):
     bank = TileBank(odd, WHITE, k)
     batch = whole_batch(bank)
     pictures = odd.pyramid(WHITE, k)
-    origins = np.repeat(batch.rays_o, TILE, 0)
+    origins = np.repeat(batch.rays_o, TILE_RAYS, 0)
     seen = 0
     for camera, picture in zip(odd.cameras, pictures, strict=True):
         origin, directions = camera.scaled(k).rays()
@@ -65,9 +66,9 @@ def test_rays_of_a_tile_are_neighbours(odd):
     """Runs of 64 rays share an origin and a block of 8x8 pixels: what the kernels are fast for."""
     bank = TileBank(odd, WHITE, 1)
     batch = whole_batch(bank)
-    assert batch.rays_o.shape == (bank.n_tiles, 3) and bank.n_rays == bank.n_tiles * TILE
-    directions = batch.rays_d.reshape(bank.n_tiles, TILE, 3)
-    live = batch.weight.reshape(bank.n_tiles, TILE) > 0
+    assert batch.rays_o.shape == (bank.n_tiles, 3) and bank.n_rays == bank.n_tiles * TILE_RAYS
+    directions = batch.rays_d.reshape(bank.n_tiles, TILE_RAYS, 3)
+    live = batch.weight.reshape(bank.n_tiles, TILE_RAYS) > 0
     assert live[:, 0].all()
     spread = np.arccos(np.clip((directions * directions[:, :1]).sum(-1), -1, 1))[live].max()
     assert spread < 8 * np.sqrt(2) * 1.1 / (1.2 * 13)  # the diagonal of 8 pixels of the widest lens
@@ -103,7 +104,9 @@ def test_the_expected_loss_is_the_mean_over_all_pixels(odd):
     assert (rich.epoch, rich.position, plain.epoch, plain.position) == (3 * n_plain, 0, n_rich, 0)
     found = np.mean([((b.target**2).mean(-1) * b.weight).sum() / 4 for b in batches])
     assert found == pytest.approx(wanted, rel=1e-5)
-    assert np.mean([b.weight.sum() for b in batches]) == pytest.approx(4 * everything.weight.mean() * TILE, rel=1e-5)
+    assert np.mean([b.weight.sum() for b in batches]) == pytest.approx(
+        4 * everything.weight.mean() * TILE_RAYS, rel=1e-5
+    )
 
 
 def test_an_epoch_visits_each_tile_once_and_orders_differ(odd):
@@ -162,11 +165,11 @@ def test_without_compiled_code_the_batch_is_the_same(odd, monkeypatch):
 def gathered(**change):
     """Three tiles of two pictures, of 2 and 3 tiles, by the compiled code alone."""
     arrays = dict(
-        directions=[np.zeros((n, TILE, 3), np.float32) for n in (2, 3)],
-        pixels=[np.zeros((n, TILE, 3), np.uint8) for n in (2, 3)],
+        directions=[np.zeros((n, TILE_RAYS, 3), np.float32) for n in (2, 3)],
+        pixels=[np.zeros((n, TILE_RAYS, 3), np.uint8) for n in (2, 3)],
         rotations=np.zeros((2, 3, 3), np.float32), image=np.array([0, 1, 1]), tile=np.array([1, 0, 2]),
         row=np.array([1, 2, 0]),
-        out=np.zeros((3, TILE, 3), np.float32), target=np.zeros((3, TILE, 3), np.float32),
+        out=np.zeros((3, TILE_RAYS, 3), np.float32), target=np.zeros((3, TILE_RAYS, 3), np.float32),
     )  # fmt: skip
     native().gather_tiles(**arrays | change)
 
@@ -183,11 +186,11 @@ def test_tiles_outside_their_picture_are_refused(image, tile, row):
 
 @pytest.mark.skipif(native() is None, reason="no compiled kernels")
 @pytest.mark.parametrize("change", [
-    {"tile": np.array([1, 0])}, {"row": np.array([1, 2])}, {"out": np.zeros((2, TILE, 3), np.float32)},
-    {"target": np.zeros((2, TILE, 3), np.float32)}, {"rotations": np.zeros((1, 3, 3), np.float32)},
-    {"directions": [np.zeros((9, TILE, 3), np.float32)]},
-    {"pixels": [np.zeros((n, TILE, 3), np.uint8) for n in (2, 2)]},
-    {"directions": [np.zeros((n, TILE, 3), np.float32) for n in (2, 2)]},
+    {"tile": np.array([1, 0])}, {"row": np.array([1, 2])}, {"out": np.zeros((2, TILE_RAYS, 3), np.float32)},
+    {"target": np.zeros((2, TILE_RAYS, 3), np.float32)}, {"rotations": np.zeros((1, 3, 3), np.float32)},
+    {"directions": [np.zeros((9, TILE_RAYS, 3), np.float32)]},
+    {"pixels": [np.zeros((n, TILE_RAYS, 3), np.uint8) for n in (2, 2)]},
+    {"directions": [np.zeros((n, TILE_RAYS, 3), np.float32) for n in (2, 2)]},
 ])  # fmt: skip
 def test_arrays_that_do_not_fit_each_other_are_refused(change):
     with pytest.raises(ValueError):

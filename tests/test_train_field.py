@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from nerfvol.cameras import Intrinsics, orbit
-from nerfvol.checkpoint import load_checkpoint, save_checkpoint
-from nerfvol.datasets import Dataset, SceneBounds
+from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.config.training import FieldConfig, FieldShape
+from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
-from nerfvol.fields import FieldShape
-from nerfvol.sampling import intersect_aabb, step_generator
-from nerfvol.train_field import FieldConfig, FieldTrainer, PixelBank, domain_of, importance_samples, render_field
+from nerfvol.field.sampling import intersect_aabb, step_generator
+from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
+from nerfvol.region import SceneBounds
+from nerfvol.training.field_trainer import FieldTrainer, PixelBank, domain_of, importance_samples, render_field
 
 TINY = FieldConfig(
     shape=FieldShape(width=16, hash_levels=4, hash_log2_table=10, hash_min=4, hash_max=24),

@@ -11,9 +11,11 @@ import pytest
 from tiny import write_scene
 from tiny_runs import TINY, Pretended, log_of, settings, start
 
-from nerfvol import runs, session, trainer
-from nerfvol.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.errors import InputError
+from nerfvol.files import run_folder
+from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
+from nerfvol.training import session, train
+from nerfvol.training.prepare import prepare_run
 
 
 # ---------------------------------------------------------------- memory
@@ -39,7 +41,7 @@ def test_the_pictures_are_let_go_once_they_are_in_tiles(
 
 
 def test_nothing_of_training_is_held_while_the_result_is_scored(tmp_path, tiny_scene, monkeypatch):
-    trained, save, load = [], trainer.save_octree, trainer.load_octree
+    trained, save, load = [], train.save_octree, train.load_octree
 
     def watch(path, octree, *rest):
         trained.append(weakref.ref(octree))
@@ -50,8 +52,8 @@ def test_nothing_of_training_is_held_while_the_result_is_scored(tmp_path, tiny_s
         assert trained[-1]() is None
         return load(path)
 
-    monkeypatch.setattr(trainer, "save_octree", watch)
-    monkeypatch.setattr(trainer, "load_octree", look)
+    monkeypatch.setattr(train, "save_octree", watch)
+    monkeypatch.setattr(train, "load_octree", look)
     start(settings(tiny_scene, tmp_path))
     assert len(trained) == 1
 
@@ -59,14 +61,14 @@ def test_nothing_of_training_is_held_while_the_result_is_scored(tmp_path, tiny_s
 # ---------------------------------------------------------------- what cannot be used
 def test_a_resumed_run_keeps_its_settings(tmp_path, tiny_scene, command):
     config = settings(tiny_scene, tmp_path)
-    runs.prepare(config)
-    save_checkpoint(tmp_path / runs.CHECKPOINT, {"phase": "start"})
-    before = (tmp_path / runs.CONFIG).read_text()
+    prepare_run(config)
+    save_checkpoint(tmp_path / run_folder.CHECKPOINT, {"phase": "start"})
+    before = (tmp_path / run_folder.CONFIG).read_text()
     code, _, err = command("train", "--resume", "--out", tmp_path, "--set", "octree.sh_degree=2")
     assert code == 2 and "octree.sh_degree = None, which cannot become 2" in err
     code, _, err = command("train", "--resume", "--out", tmp_path, "--background", "black")
     assert code == 2 and "background = " in err
-    assert (tmp_path / runs.CONFIG).read_text() == before
+    assert (tmp_path / run_folder.CONFIG).read_text() == before
 
 
 @pytest.mark.parametrize("state", [
@@ -76,16 +78,16 @@ def test_a_resumed_run_keeps_its_settings(tmp_path, tiny_scene, command):
     {"phase": "octree", "trainer": {}, "stages": []}, {"phase": "octree", "trainer": {}, "running": None},
 ])  # fmt: skip
 def test_a_foreign_checkpoint_is_one_sentence(tmp_path, tiny_scene, command, state):
-    runs.prepare(settings(tiny_scene, tmp_path))
+    prepare_run(settings(tiny_scene, tmp_path))
     filled = {"elapsed": 0.0, "log_bytes": 0, "stages": {}, "steps": {}, "phase_started": 0.0, "running": 0.1}
-    save_checkpoint(tmp_path / runs.CHECKPOINT, {**filled, **state} if "trainer" in state else state)
+    save_checkpoint(tmp_path / run_folder.CHECKPOINT, {**filled, **state} if "trainer" in state else state)
     code, _, err = command("train", "--resume", "--out", tmp_path)
-    assert code == 2 and str(tmp_path / runs.CHECKPOINT) in err and err.count("\n") == 1, err
+    assert code == 2 and str(tmp_path / run_folder.CHECKPOINT) in err and err.count("\n") == 1, err
 
 
 def test_a_scene_of_nothing_is_said_at_once(tmp_path):
     """White pictures on a white background hold nothing; on a black one they do."""
-    from nerfvol.pictures import write_png
+    from nerfvol.files.pictures import write_png
 
     scene = write_scene(tmp_path / "scene", {"train": 3, "val": 1}, size=24)
     for path in scene.rglob("*.png"):
@@ -108,16 +110,16 @@ def test_a_collapse_is_said_early(tmp_path, tiny_scene, init, section, more):
 
 @pytest.mark.parametrize("error", ["nan", "inf"])
 def test_divergence_does_not_reach_a_checkpoint(tmp_path, tiny_scene, monkeypatch, error):
-    step = trainer.OctreePhase.step
+    step = train.OctreePhase.step
 
     def explode(self, progress):
         found, samples = step(self, progress)
         return (float(error) if self.steps_done == 6 else found), samples
 
-    monkeypatch.setattr(trainer.OctreePhase, "step", explode)
+    monkeypatch.setattr(train.OctreePhase, "step", explode)
     with pytest.raises(InputError, match=f"diverged at step 6.*error is {error}.*learning rates"):
         start(settings(tiny_scene, tmp_path))
-    assert load_checkpoint(tmp_path / runs.CHECKPOINT)["trainer"]["step_count"] == 5
+    assert load_checkpoint(tmp_path / run_folder.CHECKPOINT)["trainer"]["step_count"] == 5
 
 
 def test_the_running_error_follows_slowly(tmp_path, tiny_scene):
@@ -155,7 +157,7 @@ def test_lego_small(tmp_path, init, command):
         "--init", init, "--config", tmp_path / "plan.yaml",
     )  # fmt: skip
     assert code == 0, err
-    metrics = json.loads((tmp_path / "run" / runs.METRICS).read_text())
+    metrics = json.loads((tmp_path / "run" / run_folder.METRICS).read_text())
     assert metrics["psnr"] > 20 and metrics["image_size"] == [100, 100]  # a white picture scores 9.8
     if init == "mlp":
         rows = metrics["stages"]

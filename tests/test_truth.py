@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from nerfvol import truth
 from nerfvol.errors import InputError
-from nerfvol.octree import Octree, explin_inverse
+from nerfvol.measure import truth
+from nerfvol.octree.rows import explin_inverse
+from nerfvol.octree.tree import Octree
 
 SIGMA = 2.0
 
@@ -83,7 +84,9 @@ def test_a_leaf_on_a_face_of_the_box_counts_inside_it_alone(tmp_path):
     """A homogeneous medium in eight leaves that reach 0.2 beyond a box of no special size: cut to half a voxel."""
     octree = Octree.from_leaves([1] * 8, list(np.ndindex(2, 2, 2)), (-0.5,) * 3, 1.0, 0, 1.0)
     octree.density = explin_inverse(np.array(SIGMA))
-    np.savez(tmp_path / "density.npz", density=np.full((41,) * 3, SIGMA), lo=[-0.3] * 3, hi=[0.3] * 3, voxel_size=[0.015] * 3)
+    np.savez(
+        tmp_path / "density.npz", density=np.full((41,) * 3, SIGMA), lo=[-0.3] * 3, hi=[0.3] * 3, voxel_size=[0.015] * 3
+    )
     scores = truth.compare(octree, truth.load_grid(tmp_path / "density.npz"))
     assert scores["density_relative_l1"] < 1e-6
     assert scores["opacity_relative_l1"] < 0.015 / 0.3  # a voxel in all on chords of at least half the box on average

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfvol.cameras import Intrinsics, orbit
-from nerfvol.octree import Octree
+from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.octree.tree import Octree
 
 TINY_SIZE = 40
 TINY_RADIUS = 0.8
@@ -37,7 +37,7 @@ def sphere_colour(points):
 
 def write_scene(folder: Path, views: dict[str, int], size: int = TINY_SIZE) -> Path:
     """A coloured sphere with alpha, in the NeRF-synthetic layout."""
-    from nerfvol.pictures import write_png
+    from nerfvol.files.pictures import write_png
 
     lens = Intrinsics(size, size, 1.4 * size, 1.4 * size, size / 2, size / 2)
     for number, (split, count) in enumerate(views.items()):

@@ -4,8 +4,12 @@ import dataclasses
 import json
 from pathlib import Path
 
-from nerfvol import cli, runs, trainer
-from nerfvol.config import Config, assemble
+from nerfvol.cli import main
+from nerfvol.config.assemble import assemble
+from nerfvol.config.training import Config
+from nerfvol.files import run_folder
+from nerfvol.training import train
+from nerfvol.training.prepare import prepare_run
 
 TINY = {
     "threads": 1,
@@ -29,22 +33,22 @@ def settings(scene, out, **more) -> Config:
 
 
 def start(config: Config, **keywords) -> Path:
-    runs.prepare(config)
-    cli.set_threads(config.threads)
-    return trainer.train(config, **keywords)
+    prepare_run(config)
+    main.set_threads(config.threads)
+    return train.train(config, **keywords)
 
 
 def product(run: Path) -> bytes:
     """The octree file, without the lengths of its metadata's paths mattering: all runs read the same scene."""
-    return (run / runs.OCTREE).read_bytes()
+    return (run / run_folder.OCTREE).read_bytes()
 
 
 def log_of(run: Path) -> list[dict]:
-    return [json.loads(line) for line in (run / runs.LOG).read_text().splitlines()]
+    return [json.loads(line) for line in (run / run_folder.LOG).read_text().splitlines()]
 
 
 def metrics_of(run: Path) -> dict:
-    return json.loads((run / runs.METRICS).read_text())
+    return json.loads((run / run_folder.METRICS).read_text())
 
 
 @dataclasses.dataclass

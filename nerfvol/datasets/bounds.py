@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras import Camera
-from nerfvol.datasets.dataset import SceneBounds
+from nerfvol.cameras.camera import Camera
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds, cube
 
 MARGIN = 1.03
 BACKGROUND_FACTOR = 16
@@ -40,11 +40,6 @@ def focus_point(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], float]:
     certainty = float(np.linalg.eigvalsh(matrix)[0])
     right = (across @ origins[:, :, None]).mean(axis=0)[:, 0]
     return np.linalg.lstsq(matrix, right, rcond=None)[0], certainty
-
-
-def cube(center: NDArray[np.float64], half: float) -> NDArray[np.float64]:
-    """(2, 3) corners."""
-    return np.stack([center - half, center + half])
 
 
 def _half_angle_tangent(camera: Camera) -> float:
@@ -98,9 +93,7 @@ def estimate_bounds(
     return _around(center, half, has_alpha), f"scene bounds: a cube of half side {half:.3f} around {how}"
 
 
-def _between(
-    cameras: Sequence[Camera], near_far: tuple[float, float], has_alpha: bool
-) -> tuple[SceneBounds, str]:
+def _between(cameras: Sequence[Camera], near_far: tuple[float, float], has_alpha: bool) -> tuple[SceneBounds, str]:
     """The cube around what forward-facing cameras see between near and far."""
     near, far = near_far
     corners = []
@@ -134,7 +127,7 @@ def _guess(cameras: Sequence[Camera], has_alpha: bool) -> tuple[SceneBounds, str
 
 def require_seen(bounds: SceneBounds, cameras: Sequence[Camera]) -> None:
     """Raises InputError unless at least one camera sees some of the bounds. Cameras inside them are fine."""
-    low, high = bounds.aabb if bounds.background_cube is None else bounds.background_cube
+    low, high = bounds.aabb if not bounds.is_unbounded else bounds.background_cube
     steps = np.linspace(0, 1, 9)
     grid = low + (high - low) * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     for camera in cameras:

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras import rigid_pose
-from nerfvol.datasets.frames import Calibration, Frame, ImageFinder, Listing, hold_out
+from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.camera import rigid_pose
+from nerfvol.datasets.listing import Frame, ImageFinder, Listing, hold_out
 from nerfvol.datasets.llff import image_folder
 from nerfvol.errors import InputError
-from nerfvol.files import read_bytes
+from nerfvol.files.atomic import read_bytes
 
 _PLACES = ("sparse/0", "colmap/sparse/0", "sparse", ".")
 # COLMAP's model ids and their parameters in its order; f stands for both focal lengths, k for k1
@@ -36,7 +37,9 @@ _MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
 _NAMES = {number: name for name, (number, _) in _MODELS.items()}
 _MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
 _AROUND = 1.25  # a lens's distortion may move a point by so much from where a pinhole would show it
-_FITTING = 0.9  # of the observations, the fewest that lie inside their images; all do where poses and points belong together
+_FITTING = (
+    0.9  # of the observations, the fewest that lie inside their images; all do where poses and points belong together
+)
 
 
 def find_model(folder: Path) -> Path | None:
@@ -139,10 +142,15 @@ def _calibration(model: str, width: int, height: int, parameters: tuple[float, .
         return values.get(key, 0.0)
 
     return Calibration(
-        width=width, height=height, fx=values.get("fx", focal), fy=values.get("fy", focal),
-        cx=values["cx"], cy=values["cy"],
+        width=width,
+        height=height,
+        fx=values.get("fx", focal),
+        fy=values.get("fy", focal),
+        cx=values["cx"],
+        cy=values["cy"],
         distortion=(get("k1"), get("k2"), get("k3"), get("k4"), get("p1"), get("p2")),
-        fisheye="FISHEYE" in model, resizable=True,
+        fisheye="FISHEYE" in model,
+        resizable=True,
     )
 
 

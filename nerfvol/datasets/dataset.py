@@ -6,50 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from nerfvol.cameras import Camera
+from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 
 NEAR_SHARE = 0.1
 """Of the median distance between cameras and the scene's middle: what counts as right before a lens."""
-
-
-@dataclass(frozen=True, eq=False)
-class SceneBounds:
-    """Where the scene is, in scene units.
-
-    ``aabb`` (2, 3) float64, lowest and highest corner: the region of detail.
-    ``background_cube`` (2, 3) or None: the larger cube, concentric with ``aabb``, that holds the surroundings of
-    photographs; None where the background is not part of the scene.
-    ``has_alpha``: the images have transparent pixels, seen over whatever background is asked for.
-    """
-
-    aabb: NDArray[np.float64]
-    background_cube: NDArray[np.float64] | None
-    has_alpha: bool
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "aabb", check_box(self.aabb, "the scene's aabb"))
-        if self.background_cube is not None:
-            object.__setattr__(self, "background_cube", check_box(self.background_cube, "the background cube"))
-
-    @property
-    def center(self) -> NDArray[np.float64]:
-        """(3,) the middle of the region of detail."""
-        return self.aabb.mean(axis=0)
-
-
-def check_box(box: ArrayLike, what: str) -> NDArray[np.float64]:
-    """The box (2, 3) float64 from (2, 3) or six numbers; InputError unless finite and not empty on any axis."""
-    corners = np.asarray(box, dtype=np.float64)
-    if corners.size != 6:
-        raise InputError(f"{what} must be two corners of three numbers, got shape {corners.shape}")
-    corners = corners.reshape(2, 3).copy()
-    if not (np.abs(corners) < 1e15).all() or not (corners[0] < corners[1]).all():
-        raise InputError(f"{what} must be finite with its first corner below the second, got {corners.tolist()}")
-    return corners
 
 
 @dataclass(eq=False)
@@ -120,7 +85,7 @@ class Dataset:
         """Which points (n, 3) are right before a camera, (n,): what is there is seen by no other and would only explain
         that one picture. None in scenes without surroundings, whose cameras stand outside."""
         hidden = np.zeros(len(points), dtype=bool)
-        if self.scene.background_cube is None:
+        if not self.scene.is_unbounded:
             return hidden
         cameras = np.stack([camera.position for camera in self.cameras])
         near = NEAR_SHARE * np.median(np.linalg.norm(cameras - self.scene.center, axis=1))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from nerfvol.errors import InputError
-from nerfvol.files import explain_os_error
+from nerfvol.files.atomic import explain_os_error
 
 UInt8 = NDArray[np.uint8]
 Item = TypeVar("Item")

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras import rigid_pose
+from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.camera import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
-from nerfvol.datasets.frames import Calibration, Frame, Listing, hold_out
 from nerfvol.datasets.images import SUFFIXES
+from nerfvol.datasets.listing import Frame, Listing, hold_out
 from nerfvol.errors import InputError
 
 POSES = "poses_bounds.npy"

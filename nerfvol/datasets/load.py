@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerfvol.cameras import Camera
-from nerfvol.datasets.blender import is_transforms_folder, read_transforms
+from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.bounds import bounds_of_box, estimate_bounds, require_seen
 from nerfvol.datasets.colmap import find_model, read_colmap
-from nerfvol.datasets.dataset import Dataset, SceneBounds, check_box
-from nerfvol.datasets.frames import Frame, Listing, listed_names
+from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
+from nerfvol.datasets.listing import Frame, Listing, listed_names
 from nerfvol.datasets.llff import is_llff_folder, read_llff
+from nerfvol.datasets.transforms import is_transforms_folder, read_transforms
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds, check_box
 
 SPLITS = ("train", "val", "test")
 

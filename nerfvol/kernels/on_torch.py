@@ -11,16 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfvol import lod
-from nerfvol.kernels import ops, reference
-from nerfvol.kernels.state import WHITE, Batch, LossOptions, Rates, StepReport, TrainState
+from nerfvol.defaults import WHITE
+from nerfvol.kernels import reference
+from nerfvol.kernels.checks import check_background, check_batch, check_early_stop, check_rays
+from nerfvol.kernels.state import OUTPUTS, TILE_RAYS, Batch, LossOptions, Rates, StepReport, TrainState
+from nerfvol.kernels.tree import kernel_tree
 from nerfvol.native import native
-from nerfvol.octree import Octree
+from nerfvol.octree import lod
+from nerfvol.octree.tree import Octree
 
 
 def _per_ray(rays_o, n: int) -> Tensor:
     o = torch.as_tensor(np.asarray(rays_o))
-    return o if len(o) == n else o.repeat_interleave(ops.TILE, 0)[:n]
+    return o if len(o) == n else o.repeat_interleave(TILE_RAYS, 0)[:n]
 
 
 def render_rays(octree: Octree, o, d, bg, eps, outputs, coarse: float = 0.0) -> dict[str, np.ndarray]:
@@ -38,7 +41,7 @@ def render_rays(octree: Octree, o, d, bg, eps, outputs, coarse: float = 0.0) -> 
         part = _render_leaves(tree, np.repeat(origin[None], len(rays), axis=0), d[rays], bg, eps, outputs)
         for name in outputs:
             out[name][rays] = part[name]
-    return {name: out[name] for name in ops.OUTPUTS if name in outputs}
+    return {name: out[name] for name in OUTPUTS if name in outputs}
 
 
 def _render_leaves(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -> dict[str, np.ndarray]:
@@ -56,7 +59,7 @@ def _render_leaves(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -
             if "normal" in outputs:
                 part["normal"] = reference.normals(octree, values, ro, rd, eps)
             parts.append(part)
-    return {k: torch.cat([p[k] for p in parts]).numpy() for k in ops.OUTPUTS if k in outputs}
+    return {k: torch.cat([p[k] for p in parts]).numpy() for k in OUTPUTS if k in outputs}
 
 
 class _Render(torch.autograd.Function):
@@ -65,7 +68,7 @@ class _Render(torch.autograd.Function):
         compiled = native()
         n = len(d)
         rgb, trans, depth = (np.empty(shape, np.float32) for shape in ((n, 3), n, n))
-        compiled.render(ops.kernel_tree(octree, values.detach().numpy()), o, d, bg, eps, rgb, trans, depth, None, None)
+        compiled.render(kernel_tree(octree, values.detach().numpy()), o, d, bg, eps, rgb, trans, depth, None, None)
         ctx.saved = (values.detach(), octree, o, d, bg, eps)
         return torch.from_numpy(rgb), torch.from_numpy(trans), torch.from_numpy(depth)
 
@@ -75,7 +78,9 @@ class _Render(torch.autograd.Function):
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
         cotangents = (g.contiguous().numpy() for g in (d_rgb, d_trans, d_depth))
-        native().render_backward(ops.kernel_tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots)
+        native().render_backward(
+            kernel_tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots
+        )
         return gradient, None, None, None, None, None
 
 
@@ -94,9 +99,9 @@ def render_values(
     """
     if values.shape != octree.values.shape:
         raise ValueError(f"values must have the octree's shape {octree.values.shape}, got {tuple(values.shape)}")
-    bg, early_stop_eps = ops.check_background(background), ops.check_early_stop(early_stop_eps)
+    bg, early_stop_eps = check_background(background), check_early_stop(early_stop_eps)
     if values.dtype == torch.float32 and native() is not None:
-        o, d = ops.check_rays(rays_o, rays_d)
+        o, d = check_rays(rays_o, rays_d)
         return _Render.apply(values.contiguous(), octree, o, d, bg, float(early_stop_eps))
     directions = torch.as_tensor(np.asarray(rays_d)).to(values.dtype)
     origins = _per_ray(rays_o, len(directions)).to(values.dtype)
@@ -105,11 +110,11 @@ def render_values(
 
 def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOptions) -> Tensor:
     """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled."""
-    o, d, bg, eps = ops.check_batch(batch, options)
+    o, d, bg, eps = check_batch(batch, options)
     if values.dtype == torch.float32 and (compiled := native()) is not None:
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
-        tree = ops.kernel_tree(octree, values.detach().contiguous().numpy())
+        tree = kernel_tree(octree, values.detach().contiguous().numpy())
         smooth = (float(options.smooth_density), float(options.smooth_colour))
         loss = (bg, eps, float(options.colour), float(options.distortion), *smooth, 1.0)
         no_optimiser = (None, None, [0.0, 0.0, 0.0], 0.0, 0.0)

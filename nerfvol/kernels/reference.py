@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfvol.octree import DENSITY_SLOT, MAX_LEVEL, OFFSETS, Octree, sh_slots
+from nerfvol.octree.rows import DENSITY_SLOT, sh_slots
+from nerfvol.octree.topology import MAX_LEVEL, OFFSETS
+from nerfvol.octree.tree import Octree
 from nerfvol.quadrature import composite_packed
 from nerfvol.sh import eval_basis
 

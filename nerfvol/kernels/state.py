@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfvol.defaults import DEFAULT_EARLY_STOP, WHITE
 from nerfvol.native import aligned, aligned_empty
-from nerfvol.octree import Octree
-from nerfvol.settings import DEFAULT_EARLY_STOP, WHITE
+from nerfvol.octree.tree import Octree
 
 SQUARE = 16
 """Pixels along a square of a view: what the kernels render as one packet."""
@@ -122,3 +122,9 @@ class TrainState:
 
     def reset_statistics(self, n_leaves: int) -> None:
         self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
+
+
+TILE_RAYS = 64
+
+
+OUTPUTS = ("rgb", "opacity", "depth", "median_depth", "normal")

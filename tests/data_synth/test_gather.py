@@ -85,7 +85,9 @@ def test_the_picture_has_the_same_bits_for_any_number_of_threads(monkeypatch):
         monkeypatch.setattr(jit, "core_count", lambda threads=threads: threads)
         scene = Scene(medium=cloud(41), lights=[SUN, lights.directional((-0.5, 0.3, 0.81), (1.0, 2.0, 3.0))])
         pictures.append(DeepShadow().render(scene, CAMERA).rgb)
-    assert pictures[0].max() > 0 and np.array_equal(pictures[1], pictures[0]) and np.array_equal(pictures[2], pictures[0])
+    assert (
+        pictures[0].max() > 0 and np.array_equal(pictures[1], pictures[0]) and np.array_equal(pictures[2], pictures[0])
+    )
 
 
 def test_gathered_light_tends_to_the_march_as_the_grid_is_refined():

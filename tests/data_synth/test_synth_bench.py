@@ -50,7 +50,11 @@ def test_the_table_compares_both_clocks_with_shadow_rays_and_makes_maps_anew(mon
     monkeypatch.setattr(bench, "March", Method(12.0, 24.0))
     monkeypatch.setattr(bench, "DeepShadow", Method(2.0, 3.0))
     bench.single_scattering("test", 8, 1)
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in capsys.readouterr().out.splitlines() if "deep" in line]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in capsys.readouterr().out.splitlines()
+        if "deep" in line
+    ]
     assert len(rows) == 3
     for row in rows:
         assert row[1:6] == ["3.000", "4.000", "3.000", f"{13 / 3:.1f}", f"{25 / 4:.1f}"]

@@ -81,9 +81,7 @@ def test_march_converges_at_second_order():
     m = media.exponential((0, 0, 0), (1, 1, 1), 0.25, 3.0)
     exact = sample_transmittance(m, O, D, method="closed")[0, 0]
     lengths = np.array([0.099, 0.0495, 0.02475])  # one, two and four steps in each of the medium's layers
-    errors = [
-        abs(sample_transmittance(m._replace(step=h), O, D, method="march")[0, 0] - exact) for h in lengths
-    ]
+    errors = [abs(sample_transmittance(m._replace(step=h), O, D, method="march")[0, 0] - exact) for h in lengths]
     order = np.polyfit(np.log(lengths), np.log(errors), 1)[0]
     assert 1.9 < order < 2.1, f"errors {errors}"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from nerfvol.cameras import Camera, Intrinsics, orbit
+from nerfvol.cameras.camera import Camera, Intrinsics, orbit
 
 LENS = Intrinsics(24, 16, 30.0, 30.0, 12.0, 8.0)
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Camera, Intrinsics, look_at, orbit
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at, orbit
 from nerfvol.datasets.bounds import BoundsHint, estimate_bounds, focus_point, require_seen
-from nerfvol.datasets.dataset import SceneBounds
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 
 NERF_SYNTHETIC = Intrinsics(800, 800, 400 / math.tan(0.3455555), 400 / math.tan(0.3455555), 400.0, 400.0)
 
@@ -42,7 +42,7 @@ def test_parallel_axes_have_no_focus():
 def test_nerf_synthetic_gives_the_classical_box():
     scene, sentence = estimate_bounds(hemisphere(), has_alpha=True)
     np.testing.assert_allclose(scene.aabb, [[-1.495] * 3, [1.495] * 3], atol=0.001)
-    assert scene.background_cube is None and "half side 1.495" in sentence
+    assert not scene.is_unbounded and "half side 1.495" in sentence
 
 
 @pytest.mark.parametrize("has_alpha", [True, False])

@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nerfvol.datasets import Dataset, load_dataset
-from nerfvol.datasets.dataset import NEAR_SHARE, SceneBounds
+from nerfvol.datasets.dataset import NEAR_SHARE, Dataset
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 from tests.datasets.scenes import random_images, ring
 
 

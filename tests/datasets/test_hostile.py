@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nerfvol.datasets import load_dataset
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from tests.datasets import scenes
 

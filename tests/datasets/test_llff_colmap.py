@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Camera
-from nerfvol.datasets import load_dataset
+from nerfvol.cameras.camera import Camera
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from tests.datasets import scenes
 
@@ -69,7 +69,7 @@ def test_forward_facing_bounds_hold_what_lies_between_near_and_far(tmp_path):
     assert scene.aabb[0, 2] <= -9 and scene.aabb[1, 2] >= -2 and scene.aabb[1, 2] < 0.5
     half = (7.2 + 0.2) / 2
     np.testing.assert_allclose(scene.aabb[:, 0], [0.1 - half, 0.1 + half], atol=1e-12)
-    assert scene.background_cube is not None
+    assert scene.is_unbounded
 
 
 def test_the_largest_copy_of_the_photographs_is_taken(tmp_path):

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfvol.datasets import load_dataset
 from nerfvol.datasets.bounds import focus_point
+from nerfvol.datasets.load import load_dataset
 
 DATA = os.environ.get("NERFVOL_DATA")
 
@@ -39,7 +39,7 @@ def test_nerf_synthetic(name, size):
     assert len(dataset) == 100 and dataset.names[:2] == ["r_0", "r_1"]
     assert dataset.images[0].shape == (100, 100, 4) and dataset.scene.has_alpha
     half = dataset.scene.aabb[1, 0]
-    assert 1.45 < half < 1.55 and dataset.scene.background_cube is None
+    assert 1.45 < half < 1.55 and not dataset.scene.is_unbounded
     np.testing.assert_allclose(dataset.scene.aabb, [[-half] * 3, [half] * 3], atol=1e-3)
     assert not any(image[[0, -1], :, 3].any() or image[:, [0, -1], 3].any() for image in dataset.images)  # nothing cut
     low, high = visual_hull(dataset, half=1.3 * half)
@@ -57,7 +57,7 @@ def test_fox_reports_the_photographs_that_are_missing():
     lens = train.cameras[0].intrinsics
     assert (lens.width, lens.height) == (135, 240) and lens.k1 == 0.0578421 and lens.p2 == 0.00015575
     assert lens.fx == 1375.52 / 8 and lens.cy == 965.268 / 8
-    assert not train.scene.has_alpha and train.scene.background_cube is not None
+    assert not train.scene.has_alpha and train.scene.is_unbounded
     point, certainty = focus_point(train.cameras)
     assert certainty > 0.3
     for camera in train.cameras:  # the fox is in every picture

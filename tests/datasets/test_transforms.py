@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfvol.cameras import Camera, Intrinsics
-from nerfvol.datasets import load_dataset
+from nerfvol.cameras.camera import Camera, Intrinsics
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from tests.datasets import scenes
 
@@ -165,7 +165,7 @@ def test_alpha_that_hides_nothing_is_dropped(tmp_path):
         image[..., 3] = 255
     scenes.write_blender(tmp_path, scenes.ring(), images, splits=("train", "val"))
     dataset = load_dataset(tmp_path)
-    assert not dataset.scene.has_alpha and dataset.scene.background_cube is not None
+    assert not dataset.scene.has_alpha and dataset.scene.is_unbounded
     np.testing.assert_array_equal(dataset.images[2], images[2][..., :3])
 
 

@@ -81,7 +81,12 @@ def _assert_close(value: Tensor, truth: Tensor, rtol: float, what: str) -> None:
 
 
 def assert_gradients_are_derivatives(
-    function: Function, inputs: Sequence[Tensor], *, rtol: float = 1e-6, step: float = 1e-3, seed: int = 0,
+    function: Function,
+    inputs: Sequence[Tensor],
+    *,
+    rtol: float = 1e-6,
+    step: float = 1e-3,
+    seed: int = 0,
     n_directions: int = 4,
 ) -> None:
     """Every input's gradient agrees with finite differences along random directions, in float64.

@@ -22,7 +22,7 @@ USE = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from tiny import make_sphere_octree
-from nerfvol import cli
+from nerfvol.cli import main as cli
 from nerfvol.octree_io import save_octree
 
 assert cli.__file__.startswith(sys.argv[2]), cli.__file__

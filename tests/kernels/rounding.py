@@ -24,7 +24,9 @@ import numpy as np
 import torch
 
 from nerfvol.kernels import reference
-from nerfvol.octree import DENSITY_SLOT, OFFSETS, Octree, explin, sh_slots
+from nerfvol.octree.rows import DENSITY_SLOT, explin, sh_slots
+from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.tree import Octree
 from nerfvol.sh import eval_basis
 
 U = 2.0**-24

@@ -10,7 +10,8 @@ import torch
 from scipy.special import erf
 
 from nerfvol.kernels import on_torch, ops
-from nerfvol.octree import Octree, explin_inverse
+from nerfvol.octree.rows import explin_inverse
+from nerfvol.octree.tree import Octree
 from tests.helpers.gradients import assert_order
 from tests.kernels.trees import unit
 

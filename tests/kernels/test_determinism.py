@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from nerfvol.kernels import on_torch, ops
-from nerfvol.octree import Octree
+from nerfvol.octree.tree import Octree
 from tests.kernels import rounding
 from tests.kernels.test_ops import BACKGROUND, Case, build, traced
 from tests.kernels.trees import camera_tiles, random_octree
@@ -23,7 +23,9 @@ def trained(seed: int, degree: int, steps: int = 4) -> tuple[Octree, ops.TrainSt
     for _ in range(steps):
         o, d = camera_tiles(octree, rng, 24)
         target, weight = rng.random((len(d), 3)).astype(np.float32), np.full(len(d), 1 / len(d), np.float32)
-        errors.append(ops.train_step(octree, state, ops.Batch(o, d, target, weight), options, RATES, 0.01).squared_error)
+        errors.append(
+            ops.train_step(octree, state, ops.Batch(o, d, target, weight), options, RATES, 0.01).squared_error
+        )
     return octree, state, errors
 
 
@@ -59,7 +61,9 @@ def test_gradients_give_the_same_bits_for_any_number_of_threads(isa, threads):
     for n in (1, 3, 2, 1):
         threads(n)
         values = torch.from_numpy(octree.values).requires_grad_()
-        found.append(torch.autograd.grad(on_torch.render_values(octree, values, o, d, BACKGROUND), values, cotangents)[0])
+        found.append(
+            torch.autograd.grad(on_torch.render_values(octree, values, o, d, BACKGROUND), values, cotangents)[0]
+        )
     assert all(torch.equal(found[0], g) for g in found[1:])
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerfvol.kernels import on_torch
-from nerfvol.octree import Octree
+from nerfvol.octree.tree import Octree
 from tests.kernels.rounding import U
 
 

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from nerfvol.kernels import on_torch, ops, reference
-from nerfvol.octree import Octree, sh_slots
+from nerfvol.kernels.state import OUTPUTS
+from nerfvol.octree.rows import sh_slots
+from nerfvol.octree.tree import Octree
 from tests.kernels import rounding
 from tests.kernels.trees import DYADIC, ODD, camera_tiles, lattice_rays, random_octree, scattered_rays, unit
 
@@ -285,8 +287,8 @@ def test_outputs_on_request_are_the_same_numbers(isa):
     octree = random_octree("mixed", 2, rng)
     o, d = camera_tiles(octree, rng, 2)
     everything = ops.render_rays(octree, o, d, BACKGROUND)
-    assert list(everything) == list(ops.OUTPUTS)
-    for name in ops.OUTPUTS:
+    assert list(everything) == list(OUTPUTS)
+    for name in OUTPUTS:
         alone = ops.render_rays(octree, o, d, BACKGROUND, outputs=(name,))
         assert list(alone) == [name] and np.array_equal(alone[name], everything[name])
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from nerfvol.kernels import ops, reference
-from nerfvol.octree import Octree, explin_inverse
+from nerfvol.octree.rows import explin_inverse
+from nerfvol.octree.tree import Octree
 from tests.kernels.trees import ODD, camera_tiles, lattice_rays, random_octree, scattered_rays, unit
 
 
@@ -91,7 +92,11 @@ def test_gradcheck_of_the_loss(terms):
     target, weight = torch.rand(4, 3, dtype=torch.float64), torch.rand(4, dtype=torch.float64)
     values = torch.from_numpy(octree.values).double().requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda v: reference.loss(octree, v, o, d, target, weight, options)[0], (values,), eps=1e-6, atol=1e-6, fast_mode=True
+        lambda v: reference.loss(octree, v, o, d, target, weight, options)[0],
+        (values,),
+        eps=1e-6,
+        atol=1e-6,
+        fast_mode=True,
     )
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from nerfvol.kernels import on_torch, ops, reference
-from nerfvol.octree import Octree, sh_slots
+from nerfvol.octree.rows import sh_slots
+from nerfvol.octree.tree import Octree
 from tests.kernels import rounding
 from tests.kernels.test_ops import Case, assert_within, build, per_ray, traced
 from tests.kernels.trees import unit
@@ -36,7 +37,9 @@ def batch_of(case: Case) -> ops.Batch:
 @functools.cache
 def true_loss_gradient(case: Case, loss: str) -> np.ndarray:
     octree = build(case)[0]
-    return on_torch.loss_gradient(octree, torch.from_numpy(octree.values).double(), batch_of(case), LOSSES[loss]).numpy()
+    return on_torch.loss_gradient(
+        octree, torch.from_numpy(octree.values).double(), batch_of(case), LOSSES[loss]
+    ).numpy()
 
 
 def loss_bound(case: Case, loss: str) -> np.ndarray:

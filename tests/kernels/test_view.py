@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Intrinsics
+from nerfvol.cameras.camera import Intrinsics
 from nerfvol.kernels import ops
 from nerfvol.kernels.state import from_squares, in_squares
-from nerfvol.octree import Octree
+from nerfvol.octree.tree import Octree
 from tests.kernels.trees import DYADIC, ODD, random_octree
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerfvol.octree import OFFSETS, Octree
+from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.tree import Octree
 
 DYADIC = {"origin": (-1.0, -1.0, -1.0), "size": 2.0}
 ODD = {"origin": (0.37, -1.21, 0.93), "size": 1.7}

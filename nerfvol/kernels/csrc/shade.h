@@ -29,7 +29,7 @@ inline void sh_basis(int degree, float x, float y, float z, float* b) {
 }
 
 // Slot of the raw density in a vertex row. Coefficient k of channel c stands at 16 (k / 4) + 4 c + k % 4, save that degree 2's
-// ninth coefficients stand at 28 + c (nerfvol/octree.py has the same rule).
+// ninth coefficients stand at 28 + c (nerfvol/octree/rows.py has the same rule).
 constexpr int kDensitySlot = 12;
 
 // Per ray: the basis in the places of a vertex row, with 1 at the raw density.

@@ -1,5 +1,5 @@
 // What follows from a set of leaves: the numbering of their corners, and where the values of new vertices come from.
-// nerfvol/topology.py has the same in numpy, used where nothing is compiled.
+// nerfvol/octree/topology.py has the same in numpy, used where nothing is compiled.
 #include "topology.h"
 
 #include <cstddef>

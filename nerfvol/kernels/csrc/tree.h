@@ -9,7 +9,7 @@ constexpr int kSquare = 16;       // pixels along a square of a view
 constexpr int kMaxLevel = 16;
 constexpr int kBuckets = 128;     // ranges of vertices; each is updated by one thread in a fixed order
 
-// The octree in the unit cube: see nerfvol/octree.py for the meaning of each array.
+// The octree in the unit cube: see nerfvol/octree/tree.py for the meaning of each array.
 struct Tree {
     const uint8_t *node_mask, *leaf_mask;        // (n_nodes)
     const int32_t *first_node, *first_leaf;      // (n_nodes) exclusive prefix sums of the masks' population counts
@@ -21,7 +21,7 @@ struct Tree {
     float origin[3], size;                       // root cube, scene units
     float density_scale;                         // 1 / scene unit
     const int32_t* node_corners;                 // (n_nodes, 8) rows of node_values; null where averages are not used
-    const float* node_values;                    // what stands in for everything below a node (nerfvol/lod.py)
+    const float* node_values;                    // what stands in for everything below a node (nerfvol/octree/lod.py)
     float coarse;                                // a node does where its side is below this many times its distance; 0: none
 };
 

@@ -1,0 +1,127 @@
+"""How files state a camera: calibration with figures left open, and its reading from JSON keys."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nerfvol.cameras.camera import Intrinsics
+from nerfvol.cameras.lens import Coefficients
+from nerfvol.errors import InputError
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Intrinsics as a file states them; what it leaves open (None) follows from the image's size.
+
+    ``resizable``: the figures are for the original photographs and the folder may hold them uniformly resized;
+    otherwise an image of another size than (width, height) is an error.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    fx: float | None = None
+    fy: float | None = None
+    angle_x: float | None = None
+    angle_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    fisheye: bool = False
+    resizable: bool = False
+
+    def intrinsics(self, width: int, height: int) -> Intrinsics:
+        """The intrinsics of an image of width x height pixels."""
+        sx, sy = self._resize(width, height)
+        fx = self.fx * sx if self.fx is not None else _focal(self.angle_x, width)
+        fy = self.fy * sy if self.fy is not None else _focal(self.angle_y, height)
+        fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)  # square pixels where only one is given
+        if fx is None or fy is None:
+            raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
+        cx = 0.5 * width if self.cx is None else self.cx * sx
+        cy = 0.5 * height if self.cy is None else self.cy * sy
+        return Intrinsics(width, height, fx, fy, cx, cy, *self.distortion, fisheye=self.fisheye)
+
+    def _resize(self, width: int, height: int) -> tuple[float, float]:
+        stated = (self.width or width, self.height or height)
+        if stated == (width, height):
+            return 1.0, 1.0
+        sx, sy = width / stated[0], height / stated[1]
+        # a resized side is rounded to whole pixels: the two scales agree to about a pixel over the smaller image
+        if self.resizable and abs(sx - sy) * min(stated) <= 2:
+            return sx, sy
+        expected = f"{stated[0]}x{stated[1]} pixels as its calibration states"
+        raise InputError(f"expected an image of {expected}, got {width}x{height}")
+
+
+def _focal(angle: float | None, size: int) -> float | None:
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise InputError(f"the field of view must be between 0 and pi radians, got {angle:g}")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+
+
+_FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+
+
+def read_matrix(value: Any) -> np.ndarray:
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"transform_matrix must be 4 rows of 4 numbers, got {value!r:.60}") from None
+
+
+def finite_number(data: Mapping[str, Any], *keys: str) -> float | None:
+    """The first of the keys that is there, as a finite number."""
+    for key in keys:
+        value = data.get(key)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+            raise InputError(f"{key} must be a finite number, got {value!r:.40}")
+        return float(value)
+    return None
+
+
+def read_calibration(data: Mapping[str, Any]) -> Calibration:
+    model = data.get("camera_model", "OPENCV")
+    if model not in _PINHOLE_MODELS + _FISHEYE_MODELS:
+        known = ", ".join(_PINHOLE_MODELS + _FISHEYE_MODELS)
+        raise InputError(f"camera_model {model!r:.40} is not supported; known models: {known}")
+    unsupported = [key for key in ("ftheta_p0", "latlong", "equirectangular") if data.get(key)]
+    if unsupported:
+        raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
+    fisheye = model in _FISHEYE_MODELS or data.get("is_fisheye") is True
+    k1, k2, k3, k4, p1, p2 = (finite_number(data, key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if fisheye:
+        p1 = p2 = 0.0  # the model has no tangential part; exporters write zeros or leftovers there
+    degrees = {key: finite_number(data, key) for key in ("x_fov", "y_fov")}
+    angles = [None if v is None else math.radians(v) for v in degrees.values()]
+    width, height = (_size(data, key) for key in ("w", "h"))
+    return Calibration(
+        width=width,
+        height=height,
+        fx=finite_number(data, "fl_x"),
+        fy=finite_number(data, "fl_y"),
+        angle_x=finite_number(data, "camera_angle_x") if angles[0] is None else angles[0],
+        angle_y=finite_number(data, "camera_angle_y") if angles[1] is None else angles[1],
+        cx=finite_number(data, "cx"),
+        cy=finite_number(data, "cy"),
+        distortion=(k1, k2, k3, k4, p1, p2),
+        fisheye=fisheye,
+    )
+
+
+def _size(data: Mapping[str, Any], key: str) -> int | None:
+    value = finite_number(data, key)
+    if value is not None and (value < 1 or value != int(value)):
+        raise InputError(f"{key} must be a whole number of pixels, got {value:g}")
+    return None if value is None else int(value)

@@ -1,0 +1,292 @@
+"""Cameras: the only place that knows axes, pixel centres, lens distortion and that ray directions have unit length.
+
+Conventions, for the whole package:
+
+- Arrays here are numpy. ``c2w`` is a camera-to-world 4x4 float64 matrix in OpenGL axes: x right, y up, looking down -z.
+- Pixel (i, j) is column i, row j; it covers [i, i+1) x [j, j+1) and is sampled at its centre (i + 1/2, j + 1/2), so
+  that the principal point of a perfectly centred camera is (width / 2, height / 2) and averaging k x k pixels divides
+  it by k. (COLMAP, instant-ngp and NeRF-synthetic all mean this; OpenCV's own calibration puts centres at integers:
+  add 1/2 to its cx, cy.)
+- Rays are o + t d with |d| = 1: t is a distance in scene units.
+- Rays of an image are listed row by row: ray j * width + i belongs to pixel (i, j).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nerfvol.cameras.lens import distort, undistort
+from nerfvol.errors import InputError
+
+Float = NDArray[np.float64]
+
+TILE_SIDE = 8
+RIGID_TOLERANCE = 1e-3
+_CACHE_BYTES = 256 << 20
+_LARGEST = 1e100  # intrinsics beyond it overflow in the powers of a lens
+_FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Projection of camera axes to pixels: size, focal lengths, principal point (all in pixels) and lens.
+
+    Without ``fisheye`` the lens is OpenCV's pinhole model: radial 1 + k1 r^2 + k2 r^4 + k3 r^6 (+ k4 r^8, nerfstudio's
+    extension; it is *not* OpenCV's rational k4) and tangential p1, p2. With ``fisheye`` it is OpenCV's fisheye model,
+    where the angle theta from the axis lands at theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) and
+    p1, p2 must be zero. Unusable values raise InputError.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    fisheye: bool = False
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"the image size must be at least 1x1 pixels, got {self.width}x{self.height}")
+        for field in fields(self)[2:-1]:
+            value = getattr(self, field.name)
+            if not abs(value) < _LARGEST:
+                raise InputError(f"camera intrinsic {field.name} must be a finite number, got {value}")
+        if not min(self.fx, self.fy) > 1 / _LARGEST:
+            raise InputError(
+                f"the focal lengths must be positive, got fx={self.fx:g}, fy={self.fy:g} (singular intrinsics)"
+            )
+        if self.fisheye and (self.p1 or self.p2):
+            raise InputError(f"a fisheye lens has no tangential distortion, got p1={self.p1:g}, p2={self.p2:g}")
+
+    @property
+    def distortion(self) -> tuple[float, float, float, float, float, float]:
+        """k1, k2, k3, k4, p1, p2."""
+        return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
+
+    def scaled(self, k: int) -> Intrinsics:
+        """The camera of an image area-averaged over k x k blocks; rows and columns that fill no block are dropped."""
+        if k < 1:
+            raise InputError(f"the downscale factor must be a positive integer, got {k}")
+        width, height = self.width // k, self.height // k
+        if width < 1 or height < 1:
+            raise InputError(f"a {self.width}x{self.height} image cannot be downscaled by {k}: nothing is left of it")
+        return replace(self, width=width, height=height, fx=self.fx / k, fy=self.fy / k, cx=self.cx / k, cy=self.cy / k)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Intrinsics:
+        """The camera of the part of the image that begins at column ``left`` and row ``top``."""
+        if min(left, top) < 0 or left + width > self.width or top + height > self.height:
+            raise InputError(
+                f"{width}x{height} pixels from column {left} and row {top} on are no part of a {self.width}x{self.height} image"
+            )
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same field of view across the width at another size; another aspect ratio crops or extends the height."""
+        s = width / self.width
+        cy = height / 2 + s * (self.cy - self.height / 2)
+        return replace(self, width=width, height=height, fx=self.fx * s, fy=self.fy * s, cx=self.cx * s, cy=cy)
+
+    def directions(self) -> NDArray[np.float32]:
+        """(height, width, 3) float32 unit directions of pixel centres in camera axes; shared, so not to be written."""
+        return _directions.get(self)
+
+    def directions_at(self, pixels: ArrayLike) -> Float:
+        """Unit directions (n, 3) float64, camera axes, of positions (n, 2) in pixels; pixel centres end in 1/2."""
+        p = np.asarray(pixels, dtype=np.float64)
+        plane = np.stack([(p[:, 0] - self.cx) / self.fx, (p[:, 1] - self.cy) / self.fy], axis=1)
+        d = undistort(plane, self.distortion, self.fisheye)
+        return d * np.array([1.0, -1.0, -1.0])  # OpenCV axes (y down, z forward) to OpenGL axes
+
+    def project(self, points: ArrayLike) -> Float:
+        """Image positions (n, 2), in pixels, of points (n, 3) in camera axes; NaN where the lens cannot see them."""
+        p = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, -1.0])
+        return distort(p, self.distortion, self.fisheye) * (self.fx, self.fy) + (self.cx, self.cy)
+
+
+class _DirectionCache:
+    """Directions per distinct intrinsics, bounded in bytes, since photo sets may have a lens for every photo."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit, self._bytes = limit, 0
+        self._kept: OrderedDict[Intrinsics, NDArray[np.float32]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, intrinsics: Intrinsics) -> NDArray[np.float32]:
+        with self._lock:
+            if intrinsics in self._kept:
+                self._kept.move_to_end(intrinsics)
+                return self._kept[intrinsics]
+        made = self._make(intrinsics)
+        with self._lock:
+            if intrinsics not in self._kept:
+                self._kept[intrinsics] = made
+                self._bytes += made.nbytes
+            while self._bytes > self._limit and len(self._kept) > 1:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        return made
+
+    @staticmethod
+    def _make(intrinsics: Intrinsics) -> NDArray[np.float32]:
+        width, height = intrinsics.width, intrinsics.height
+        out = np.empty((height, width, 3), dtype=np.float32)
+        columns = np.arange(width) + 0.5
+        band = max(1, (1 << 14) // width)  # float64 temporaries of a few rows stay in the processor's cache
+        for top in range(0, height, band):
+            rows = np.arange(top, min(top + band, height)) + 0.5
+            pixels = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None]), axis=-1).reshape(-1, 2)
+            out[top : top + len(rows)] = intrinsics.directions_at(pixels).reshape(len(rows), width, 3)
+        return out
+
+
+_directions = _DirectionCache(_CACHE_BYTES)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Intrinsics and a rigid pose.
+
+    ``c2w`` (4, 4) or (3, 4) must be a rotation and a translation: its 3x3 part orthonormal and right-handed to within
+    1e-3, as tools that write a few decimals leave it; it is then replaced by the nearest exact rotation so that
+    |d| = 1 holds to rounding. Scaled, mirrored, sheared and non-finite poses raise InputError.
+    """
+
+    intrinsics: Intrinsics
+    c2w: Float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "c2w", rigid_pose(self.c2w))
+
+    @property
+    def position(self) -> Float:
+        """(3,) the camera's centre in the world."""
+        return self.c2w[:3, 3]
+
+    @property
+    def forward(self) -> Float:
+        """(3,) unit viewing direction in the world."""
+        return -self.c2w[:3, 2]
+
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The common origin (3,) and unit directions (height * width, 3) of the image's rays, row by row, float32."""
+        rotation = self.c2w[:3, :3].astype(np.float32)
+        return self.c2w[:3, 3].astype(np.float32), self.intrinsics.directions().reshape(-1, 3) @ rotation.T
+
+    def rays_at(self, pixels: ArrayLike) -> tuple[Float, Float]:
+        """The origin (3,) and unit directions (n, 3) through image positions (n, 2), in float64."""
+        return self.c2w[:3, 3].copy(), self.intrinsics.directions_at(pixels) @ self.c2w[:3, :3].T
+
+    def project(self, points: ArrayLike) -> Float:
+        """Image positions (n, 2), in pixels, of world points (n, 3); NaN where the lens cannot see the point."""
+        return self.intrinsics.project((np.asarray(points, dtype=np.float64) - self.c2w[:3, 3]) @ self.c2w[:3, :3])
+
+    def scaled(self, k: int) -> Camera:
+        """The camera of the image area-averaged over k x k blocks."""
+        return Camera(self.intrinsics.scaled(k), self.c2w)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the image at another size (see Intrinsics.resized)."""
+        return Camera(self.intrinsics.resized(width, height), self.c2w)
+
+
+def rigid_pose(c2w: ArrayLike) -> Float:
+    """The (4, 4) float64 pose, with the nearest exact rotation, of a camera-to-world matrix (4, 4) or (3, 4)."""
+    matrix = np.asarray(c2w, dtype=np.float64)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"a camera pose must be a 4x4 (or 3x4) matrix, got shape {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise InputError("a camera pose must hold finite numbers only, got NaN or infinity")
+    if not np.abs(matrix[:3, 3]).max() < _FARTHEST:
+        raise InputError(f"a camera must be within {_FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
+    if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
+        raise InputError(f"the last row of a camera pose must be 0 0 0 1, got {_numbers(matrix[3])}")
+    r = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(r.T @ r - np.eye(3)).max()
+        lengths = np.linalg.norm(r, axis=0)
+    if not error <= RIGID_TOLERANCE:
+        raise InputError(
+            "a camera pose must be rigid (an orthonormal rotation and a translation), got a 3x3 part with columns of "
+            f"lengths {_numbers(lengths)} that is orthonormal only to {error:.2g}"
+        )
+    if np.linalg.det(r) < 0:
+        raise InputError("a camera pose must be rigid and right-handed, got a mirrored rotation (determinant -1)")
+    u, _, vt = np.linalg.svd(r)
+    out = np.eye(4)
+    out[:3, :3] = u @ vt
+    out[:3, 3] = matrix[:3, 3]
+    return out
+
+
+def _numbers(values: ArrayLike) -> str:
+    return " ".join(f"{v:.4g}" for v in np.ravel(values))
+
+
+def tile_pixels(width: int, height: int) -> NDArray[np.int64]:
+    """Flat pixel indices (n_tiles, 64) of an image's 8x8 tiles: row by row, and so inside; -1 outside the image."""
+    columns = np.arange(math.ceil(width / TILE_SIDE) * TILE_SIDE)
+    rows = np.arange(math.ceil(height / TILE_SIDE) * TILE_SIDE)
+    inside = (rows[:, None] < height) & (columns[None, :] < width)
+    flat = np.where(inside, rows[:, None] * width + columns[None, :], -1).astype(np.int64)
+    blocks = flat.reshape(len(rows) // TILE_SIDE, TILE_SIDE, len(columns) // TILE_SIDE, TILE_SIDE)
+    return np.ascontiguousarray(blocks.transpose(0, 2, 1, 3)).reshape(-1, TILE_SIDE * TILE_SIDE)
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float:
+    """The pose (4, 4) at ``eye`` that looks at ``target`` with ``up`` upwards in the image."""
+    eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+    back = eye - target
+    right = np.cross(up, back)
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up) * np.linalg.norm(back):
+        raise InputError(f"cannot look from {_numbers(eye)} at {_numbers(target)} with {_numbers(up)} upwards")
+    back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    return pose
+
+
+def orbit(
+    n: int,
+    *,
+    center: ArrayLike,
+    radius: float,
+    elevation_deg: float,
+    intrinsics: Intrinsics,
+    up: Sequence[float] = (0.0, 0.0, 1.0),
+) -> list[Camera]:
+    """n cameras evenly spaced on a circle, all looking at its middle.
+
+    ``radius`` is the distance to ``center``, ``elevation_deg`` the angle above the plane through ``center`` normal to
+    ``up`` (-90 < elevation < 90). The first camera's azimuth is toward the world axis least aligned with ``up``.
+    """
+    if n < 1 or not radius > 0 or not -90 < elevation_deg < 90:
+        raise InputError(
+            f"an orbit needs at least one view, a positive radius and an elevation between -90 and 90 degrees, "
+            f"got {n}, {radius:g} and {elevation_deg:g}"
+        )
+    middle, axis = np.asarray(center, dtype=np.float64), np.asarray(up, dtype=np.float64)
+    axis = axis / np.linalg.norm(axis)
+    start = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    start = start - axis * (start @ axis)
+    start /= np.linalg.norm(start)
+    side = np.cross(axis, start)
+    elevation = math.radians(elevation_deg)
+    cameras = []
+    for azimuth in 2 * math.pi * np.arange(n) / n:
+        outward = math.cos(azimuth) * start + math.sin(azimuth) * side
+        eye = middle + radius * (math.cos(elevation) * outward + math.sin(elevation) * axis)
+        cameras.append(Camera(intrinsics, look_at(eye, middle, axis)))
+    return cameras

@@ -1,0 +1,150 @@
+"""Where to look from: camera paths in JSON files, and the orbit that fits a scene. docs/cli.md has the JSON's fields.
+
+The JSON is that of ``transforms*.json`` files without images: intrinsics at the top, overridden frame by frame, and a
+list of camera-to-world matrices, so a data set's own file can be given as a path.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.camera import Camera, Intrinsics, orbit
+from nerfvol.errors import InputError
+from nerfvol.files.atomic import read_json
+
+DEFAULT_SIZE = (800, 800)
+DEFAULT_ANGLE_X = 0.6911
+"""Horizontal field of view, radians (40 degrees), where a file states none: that of the NeRF-synthetic scenes."""
+LARGEST_SIDE = 16384
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> list[Camera]:
+    """The cameras of a JSON path, resized to ``size`` (width, height) where given; 800x800 where nobody states one.
+
+    Raises:
+        InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
+    """
+    # The dialects' one reader of intrinsics; its own read_cameras insists on images and focal lengths.
+    from nerfvol.cameras.calibration import read_calibration, read_matrix
+
+    document = read_json(path)
+    frames = document.get("frames") if isinstance(document, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: expected a camera path, an object with a non-empty list 'frames'")
+    shared = {key: value for key, value in document.items() if key != "frames"}
+    cameras = []
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+            raise InputError(f"{path}, frame {index}: expected an object with a transform_matrix")
+        try:
+            camera = _camera(read_calibration({**shared, **frame}), read_matrix(frame["transform_matrix"]), size)
+        except InputError as error:
+            raise InputError(f"{path}, frame {index}: {error}") from error
+        cameras.append(camera)
+    return cameras
+
+
+def _camera(calibration: Calibration, c2w: np.ndarray, size: tuple[int, int] | None) -> Camera:
+    width, height = calibration.width, calibration.height
+    if width is None or height is None:
+        width, height = size or DEFAULT_SIZE
+    if max(width, height) > LARGEST_SIDE:
+        raise InputError(f"pictures have at most {LARGEST_SIDE} pixels a side, got {width}x{height}")
+    if all(focal is None for focal in (calibration.fx, calibration.fy, calibration.angle_x, calibration.angle_y)):
+        calibration = dataclasses.replace(calibration, angle_x=DEFAULT_ANGLE_X)
+    camera = Camera(calibration.intrinsics(width, height), c2w)
+    return camera.resized(*size) if size else camera
+
+
+def cameras_document(cameras: Sequence[Camera], names: Sequence[str]) -> dict[str, Any]:
+    """``cameras`` as a document that :func:`load_cameras` reads; ``names`` become the frames' file_path."""
+    frames = []
+    for camera, name in zip(cameras, names, strict=True):
+        lens = camera.intrinsics
+        frame: dict[str, Any] = {
+            "file_path": name, "w": lens.width, "h": lens.height,
+            "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy,
+            **{key: getattr(lens, key) for key in _LENS if getattr(lens, key)},
+            "transform_matrix": camera.c2w.tolist(),
+        }  # fmt: skip
+        if lens.fisheye:
+            frame["camera_model"] = "OPENCV_FISHEYE"
+        frames.append(frame)
+    return {"frames": frames}
+
+
+def describe_orbit(cameras: Sequence[Camera], aabb: Any) -> dict[str, Any]:
+    """The orbit that continues the training cameras, JSON-able, for the octree's metadata (key "orbit").
+
+    The centre is the point nearest to all viewing axes where those meet (photographs taken around something), else
+    the middle of ``aabb`` (2, 3); radius and elevation are the medians over the cameras; up is their mean up.
+    """
+    positions = np.stack([camera.position for camera in cameras])
+    forwards = np.stack([camera.forward for camera in cameras])
+    box = np.asarray(aabb, dtype=np.float64)
+    center = _nearest_point_to_axes(positions, forwards)
+    if center is None or np.any(center < box[0]) or np.any(center > box[1]):
+        center = box.mean(axis=0)
+    up = _mean_up(cameras)
+    offsets = positions - center
+    radii = np.linalg.norm(offsets, axis=1)
+    radius = float(np.median(radii))
+    if not radius > 0:
+        radius = float(np.linalg.norm(box[1] - box[0]))
+    height = (offsets @ up) / np.maximum(radii, 1e-12)
+    elevation = math.degrees(math.asin(float(np.clip(np.median(height), -1.0, 1.0))))
+    lens = cameras[0].intrinsics
+    return {
+        "center": center.tolist(), "radius": radius, "elevation_deg": float(np.clip(elevation, -80.0, 80.0)),
+        "up": up.tolist(), "camera_angle_x": 2.0 * math.atan(0.5 * lens.width / lens.fx),
+        "size": [lens.width, lens.height],
+    }  # fmt: skip
+
+
+def orbit_cameras(count: int, description: Mapping[str, Any], size: tuple[int, int] | None) -> list[Camera]:
+    """``count`` cameras on the orbit of :func:`describe_orbit` (missing keys: see :func:`default_orbit`)."""
+    width, height = size or tuple(description.get("size") or DEFAULT_SIZE)
+    focal = 0.5 * width / math.tan(0.5 * float(description.get("camera_angle_x", DEFAULT_ANGLE_X)))
+    lens = Intrinsics(int(width), int(height), focal, focal, 0.5 * width, 0.5 * height)
+    return orbit(
+        count, center=description["center"], radius=float(description["radius"]),
+        elevation_deg=float(description["elevation_deg"]), intrinsics=lens, up=description.get("up", (0.0, 0.0, 1.0)),
+    )  # fmt: skip
+
+
+def default_orbit(aabb: Any) -> dict[str, Any]:
+    """An orbit that shows the whole box ``aabb`` (2, 3) from 25 degrees above, where no training camera is known."""
+    box = np.asarray(aabb, dtype=np.float64)
+    sphere = 0.5 * float(np.linalg.norm(box[1] - box[0]))
+    radius = sphere / math.sin(0.5 * DEFAULT_ANGLE_X)
+    return {"center": box.mean(axis=0).tolist(), "radius": radius, "elevation_deg": 25.0}
+
+
+def _nearest_point_to_axes(positions: np.ndarray, forwards: np.ndarray) -> np.ndarray | None:
+    """The least-squares meeting point of the viewing axes; None where they are too parallel or it lies behind them."""
+    projectors = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    normal_matrix = projectors.sum(axis=0)
+    if np.linalg.eigvalsh(normal_matrix)[0] < 1e-3 * len(positions):
+        return None
+    point = np.linalg.solve(normal_matrix, np.einsum("nij,nj->i", projectors, positions))
+    in_front = np.einsum("ni,ni->n", point - positions, forwards) > 0
+    return point if in_front.mean() > 0.5 else None
+
+
+def _mean_up(cameras: Sequence[Camera]) -> np.ndarray:
+    """The mean of the cameras' up axes; the world axis nearest to it where one is within 20 degrees."""
+    mean = np.sum([camera.c2w[:3, 1] for camera in cameras], axis=0)
+    length = np.linalg.norm(mean)
+    if length < 1e-6 * len(cameras):
+        return np.array([0.0, 0.0, 1.0])
+    mean /= length
+    axis = int(np.argmax(np.abs(mean)))
+    return np.sign(mean[axis]) * np.eye(3)[axis] if abs(mean[axis]) > math.cos(math.radians(20.0)) else mean

@@ -1,0 +1,1 @@
+"""The ``nerfvol`` command: one file a command."""

@@ -1,0 +1,7 @@
+"""``python -m nerfvol.cli`` is ``nerfvol``."""
+
+import sys
+
+from nerfvol.cli.main import main
+
+sys.exit(main())

@@ -1,0 +1,134 @@
+"""``nerfvol bench``: repeatable medians of loading, rendering and training speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfvol import __version__
+from nerfvol.cameras.camera import Camera
+from nerfvol.cameras.paths import orbit_cameras
+from nerfvol.cli.target import find_orbit
+from nerfvol.config.values import Count
+from nerfvol.files import run_folder
+from nerfvol.files.atomic import ensure_writable_folder, write_json
+from nerfvol.kernels import ops
+from nerfvol.machine import describe_hardware, usable_cores
+from nerfvol.measure import plots, roofline
+from nerfvol.measure.bench import (
+    BASE_SIZE,
+    VIEWS,
+    exponents,
+    measure_loading,
+    measure_reference,
+    measure_rendering,
+    measure_sizes,
+)
+from nerfvol.octree.io import load_octree
+
+
+def run_bench(options: BenchOptions) -> int:
+    """Measure everything, print tables, write JSON where asked."""
+    if options.json is not None:
+        ensure_writable_folder(Path(options.json).parent)
+    if options.plot is not None:
+        plots.check_plot(options.plot, options.runs)
+    path = run_folder.octree_path(options.target)
+    threads = options.threads or usable_cores()
+    ops.set_threads(threads)
+    octree, metadata = load_octree(path)
+    orbit = find_orbit(options.target, octree, metadata)
+    machine = roofline.measure_machine(threads)
+
+    def cameras(size: int) -> list[Camera]:
+        return orbit_cameras(VIEWS, orbit, (size, size))
+
+    record: dict[str, Any] = {
+        "nerfvol": __version__,
+        "hardware": describe_hardware(),
+        "threads": threads,
+        "machine": {**vars(machine), "bandwidth": machine.bandwidth},
+        "view_size": BASE_SIZE,
+        "octree": {"path": str(path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
+        "file": measure_loading(path, options.repeats),
+        "render": measure_rendering(octree, [cameras(size) for size in options.sizes], threads, options.repeats),
+        "size": measure_sizes(octree, cameras(BASE_SIZE), options.repeats, machine),
+    }
+    record["exponents"] = exponents(record["size"])
+    if options.reference:
+        record["reference"] = measure_reference(octree, cameras(BASE_SIZE), record)
+    print_tables(record)
+    if options.json is not None:
+        write_json(options.json, record)
+        print(f"figures: {options.json}")
+    if options.plot is not None:
+        plots.draw_bench(options.plot, record, options.runs)
+        print(f"picture: {options.plot}")
+    return 0
+
+
+def print_tables(record: dict[str, Any]) -> None:
+    """The record as text."""
+    hardware, octree, file = record["hardware"], record["octree"], record["file"]
+    print(f"{hardware['cpu']}, {record['threads']} threads, kernels {hardware['kernel_path']}")
+    megabytes = f"{file['bytes'] / 1e6:.1f} MB"
+    print(f"{octree['path']}: {octree['leaves']:,} leaves, {megabytes}, loads in {file['seconds']:.2f} s\n")
+    sizes = sorted({row["size"] for row in record["render"]})
+    print("frames a second      " + "".join(f"{f'{size}x{size}':>12s}" for size in sizes))
+    for isa, threads in dict.fromkeys((row["isa"], row["threads"]) for row in record["render"]):
+        rates = [r["frames_per_second"] for r in record["render"] if (r["isa"], r["threads"]) == (isa, threads)]
+        plural = "s" if threads > 1 else " "
+        print(f"{isa:10s} {threads:2d} thread{plural} " + "".join(f"{rate:12.2f}" for rate in rates))
+    print(f"\nfinest grid      leaves   frames/s at {BASE_SIZE}²   training rays/s   segments/ray")
+    for row in record["size"]:
+        print(
+            f"{2 ** row['level']:8d}³ {row['leaves']:12,d} {row['frames_per_second']:16.2f} "
+            f"{row['train_rays_per_second']:18,.0f} {row['samples_per_ray']:14.1f}"
+        )
+    _print_roofline(record)
+    if "reference" in record:
+        r = record["reference"]
+        print(
+            f"\nrays a second at {BASE_SIZE}²: kernels {r['kernel_rays_per_second']:,.0f}; plain torch "
+            f"{r['torch_rays_per_second']:,.0f} ({r['kernel_over_torch']:,.0f} times slower); 8x256 network of the "
+            f"NeRF paper {r['paper_mlp_rays_per_second']:,.0f} ({r['kernel_over_paper_mlp']:,.0f} times slower)"
+        )
+        print(
+            f"one training step of {r['train_step_rays']:,} rays: kernels {r['kernel_train_step_seconds'] * 1e3:.1f} ms, "
+            f"plain torch {r['torch_train_step_seconds']:.1f} s ({r['train_step_kernel_over_torch']:,.0f} times slower)"
+        )
+
+
+def _print_roofline(record: dict[str, Any]) -> None:
+    machine, powers = record["machine"], record["exponents"]
+    if powers["frame"] is not None:
+        print(f"time grows as leaves^{powers['frame']:.2f} a frame, leaves^{powers['train_ray']:.2f} a training ray")
+    print(
+        f"\nroofline: memory {machine['read'] / 1e9:.1f} GB/s read, {machine['copy'] / 1e9:.1f} GB/s copied; float32 "
+        f"{machine['operations'] / 1e9:.0f} GFLOP/s ({machine['threads']} threads)"
+    )
+    print("                 ------- frames/s allowed by -------   --- training Mrays/s allowed by ---")
+    print("finest grid        MB/frame   bandwidth  arithmetic    bytes/ray   bandwidth  arithmetic")
+    for row in record["size"]:
+        print(
+            f"{2 ** row['level']:8d}³ {row['frame_bytes'] / 1e6:17.1f} {row['frames_per_second_by_bandwidth']:11.0f} "
+            f"{row['frames_per_second_by_arithmetic']:11.0f} {row['train_ray_bytes']:12.0f} "
+            f"{row['train_rays_per_second_by_bandwidth'] / 1e6:11.1f} "
+            f"{row['train_rays_per_second_by_arithmetic'] / 1e6:11.1f}"
+        )
+
+
+@dataclass
+class BenchOptions:
+    """``nerfvol bench``."""
+
+    target: str = ""
+    sizes: tuple[Count, ...] = (400, 800, 1600)
+    repeats: Count = 5
+    data: str | None = None
+    reference: bool = True
+    json: str | None = None
+    plot: str | None = None
+    runs: tuple[str, ...] = ()
+    threads: int = 0

@@ -1,0 +1,1 @@
+"""Settings: what a value may be, and defaults < YAML file < command line."""

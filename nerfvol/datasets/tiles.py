@@ -1,0 +1,151 @@
+"""Training rays in 8x8 tiles: what the octree's kernels eat, drawn in a fixed, resumable order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfvol.cameras.camera import tile_pixels
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.kernels.state import TILE_RAYS, Batch
+from nerfvol.native import native
+
+
+@dataclass
+class Cursor:
+    """Where one of the two shuffled queues stands: position inside an epoch's permutation."""
+
+    epoch: int = 0
+    position: int = 0
+
+
+class TileBank:
+    """All training pixels of one pyramid level as tiles.
+
+    A tile is *plain* when all its pixels have the background's colour. Plain tiles teach little but are many: they are
+    drawn less often and weigh more, so that the expected loss stays the mean over all pixels. The plain tiles of a picture
+    share one tile of pixels: where much is background, the bank is a fraction of the pictures.
+    """
+
+    def __init__(self, dataset: Dataset, background: Sequence[float], k: int):
+        sorted_out = dataset.pyramid(background, k, lambda image: _sort_out(_tiled(image), background))
+        self.pixels = [pixels for pixels, _ in sorted_out]
+        self.row = np.concatenate([row for _, row in sorted_out])
+        cameras = [c.scaled(k) for c in dataset.cameras]
+        self.origins = np.stack([c.c2w[:3, 3] for c in cameras]).astype(np.float32)
+        self.rotations = np.stack([c.c2w[:3, :3] for c in cameras]).astype(np.float32)
+        self.pixel_angle = float(np.median([1 / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras]))
+        tables: dict = {}  # camera-space directions in tile order, per distinct intrinsics
+        self._directions: list[np.ndarray] = []
+        insides, image_of, tile_of = [], [], []
+        for i, camera in enumerate(cameras):
+            intrinsics = camera.intrinsics
+            flat = tile_pixels(intrinsics.width, intrinsics.height)
+            if intrinsics not in tables:
+                tables[intrinsics] = intrinsics.directions().reshape(-1, 3)[np.maximum(flat, 0)]
+            self._directions.append(tables[intrinsics])
+            insides.append(flat >= 0 if (flat < 0).any() else None)
+            image_of.append(np.full(len(flat), i, np.int32))
+            tile_of.append(np.arange(len(flat), dtype=np.int32))
+        self.plain = self.row == 0
+        self.image = np.concatenate(image_of)
+        self.tile = np.concatenate(tile_of)
+        self._inside = insides
+        self._padded = any(inside is not None for inside in insides)
+        self.rich_tiles, self.plain_tiles = (
+            np.flatnonzero(chosen).astype(np.int32) for chosen in (~self.plain, self.plain)
+        )
+
+    @property
+    def n_tiles(self) -> int:
+        return len(self.image)
+
+    @property
+    def n_rays(self) -> int:
+        return self.n_tiles * TILE_RAYS
+
+    def draw(self, n: int, rich_share: float, seed: int, rich: Cursor, plain: Cursor) -> Batch:
+        """The next n tiles: a share of ``rich_share`` from the rich queue, the rest from the plain one."""
+        n_rich = n if not len(self.plain_tiles) else min(n, round(n * rich_share))
+        if not len(self.rich_tiles):
+            n_rich = 0
+        parts, weights = [], []
+        for tiles, cursor, count, stream in (
+            (self.rich_tiles, rich, n_rich, 0),
+            (self.plain_tiles, plain, n - n_rich, 1),
+        ):
+            if count:
+                parts.append(_next(tiles, cursor, count, [seed, stream]))
+                weights.append(np.full(count, len(tiles) / self.n_tiles * n / count, np.float32))
+        return self.batch(np.concatenate(parts), np.concatenate(weights))
+
+    def batch(self, tiles: np.ndarray, tile_weights: np.ndarray) -> Batch:
+        """Rays and colours of the given tiles; every ray weighs its tile's weight, padding weighs 0."""
+        order = np.argsort(tiles, kind="stable")  # neighbours in one image share the cache
+        tiles, tile_weights = tiles[order], tile_weights[order]
+        image, tile, row = self.image[tiles], self.tile[tiles], self.row[tiles]
+        directions = np.empty((len(tiles), TILE_RAYS, 3), np.float32)
+        target = np.empty((len(tiles), TILE_RAYS, 3), np.float32)
+        weight = np.repeat(tile_weights[:, None], TILE_RAYS, 1)
+        if (compiled := native()) is not None:
+            compiled.gather_tiles(self._directions, self.pixels, self.rotations, image, tile, row, directions, target)
+        else:
+            for i, (m, t, r) in enumerate(zip(image, tile, row, strict=True)):
+                np.matmul(self._directions[m][t], self.rotations[m].T, out=directions[i])
+                target[i] = self.pixels[m][r]
+            target *= np.float32(1 / 255)
+        if self._padded:
+            for i, (m, t) in enumerate(zip(image, tile, strict=True)):
+                if self._inside[m] is not None:
+                    weight[i] *= self._inside[m][t]
+        return Batch(self.origins[image], directions.reshape(-1, 3), target.reshape(-1, 3), weight.reshape(-1))
+
+
+def _tiled(image: np.ndarray) -> np.ndarray:
+    """An image (h, w, 3) as tiles (n_tiles, 64, 3) in tile_pixels' order; padding repeats the border."""
+    h, w = image.shape[:2]
+    padded = np.pad(image, ((0, -h % 8), (0, -w % 8), (0, 0)), mode="edge") if h % 8 or w % 8 else image
+    rows, cols = padded.shape[0] // 8, padded.shape[1] // 8
+    return padded.reshape(rows, 8, cols, 8, 3).transpose(0, 2, 1, 3, 4).reshape(-1, TILE_RAYS, 3)
+
+
+def _sort_out(tiles: np.ndarray, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (1 + rich tiles, 64, 3), a plain tile first, and which of them each of ``tiles`` (n, 64, 3) has: (n,)."""
+    plain_tile = np.tile(np.round(np.asarray(background) * 255).astype(np.uint8), (1, TILE_RAYS, 1))
+    rich = (tiles != plain_tile).any((1, 2))
+    return np.concatenate([plain_tile, tiles[rich]]), np.where(rich, np.cumsum(rich), 0).astype(np.int32)
+
+
+def rich_share(dataset: Dataset, background: Sequence[float], views: int = 4) -> float:
+    """Share of tiles that are not plain, in a few of the dataset's views: how large a TileBank will be."""
+    rows = dataset.evenly(views).pyramid(background, 1, lambda image: _sort_out(_tiled(image), background)[1])
+    return float(np.mean(np.concatenate(rows) > 0))
+
+
+def _next(tiles: np.ndarray, cursor: Cursor, count: int, seed: list[int]) -> np.ndarray:
+    """The next ``count`` of an endless sequence of shuffled epochs."""
+    out = []
+    while count > 0:
+        order = _permutation(len(tiles), (*seed, cursor.epoch))
+        taken = order[cursor.position : cursor.position + count]
+        out.append(tiles[taken])
+        count -= len(taken)
+        cursor.position += len(taken)
+        if cursor.position == len(tiles):
+            cursor.epoch, cursor.position = cursor.epoch + 1, 0
+    return np.concatenate(out)
+
+
+_cached: dict[tuple, np.ndarray] = {}
+
+
+def _permutation(n: int, seed: tuple[int, ...]) -> np.ndarray:
+    key = (n, *seed)
+    if key not in _cached:
+        if len(_cached) > 4:
+            _cached.clear()
+        order = np.random.Generator(np.random.Philox(np.random.SeedSequence(seed))).permutation(n)
+        _cached[key] = order.astype(np.int32)
+    return _cached[key]

@@ -1,0 +1,1 @@
+"""The neural field: encodings, networks, occupancy, samples along rays."""

@@ -1,0 +1,1 @@
+"""Scores, truth, speed and plots."""

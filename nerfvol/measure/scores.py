@@ -1,0 +1,84 @@
+"""Scores of a representation on posed images: PSNR and SSIM per view, their means, and the time a view took."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras.camera import Camera
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import map_threads
+from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
+from nerfvol.kernels import ops
+from nerfvol.measure.metrics import psnr, ssim
+from nerfvol.octree.tree import Octree
+from nerfvol.views import render_image
+
+LARGEST_PSNR = 100.0
+"""Equal images have infinite PSNR, which JSON cannot say; an 8-bit image has 100 dB only where it is equal."""
+
+Float = NDArray[np.float32]
+
+
+def score_views(
+    render: Callable[[Camera], Float],
+    dataset: Dataset,
+    background: Sequence[float],
+    on_view: Callable[[int, Float, Float], None] | None = None,
+) -> dict[str, Any]:
+    """Scores of ``render`` (camera -> (H, W, 3) float32) against every image of ``dataset`` over ``background``.
+
+    Returns psnr and ssim (means of the per-view values), seconds_per_frame (median) and rows with name, psnr, ssim and
+    seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair.
+    """
+
+    def score(rendered: tuple[int, Float, float]) -> dict[str, Any]:
+        index, image, seconds = rendered
+        truth = dataset.composited(index, background)
+        return {
+            "name": dataset.names[index],
+            "psnr": min(psnr(image, truth), LARGEST_PSNR),
+            "ssim": ssim(image, truth),
+            "seconds": seconds,
+        }
+
+    rows, at_once = [], ops.get_threads()
+    for first in range(0, len(dataset), at_once):
+        # A few views one after the other, for their times; then their scores side by side.
+        few = []
+        for index in range(first, min(first + at_once, len(dataset))):
+            started = time.perf_counter()
+            image = render(dataset.cameras[index])
+            seconds = time.perf_counter() - started
+            few.append((index, np.clip(image, 0.0, 1.0), seconds))
+        rows += map_threads(score, few, at_once)
+        if on_view is not None:
+            for index, image, _ in few:
+                on_view(index, dataset.composited(index, background), image)
+    return {
+        "psnr": statistics.fmean(row["psnr"] for row in rows),
+        "ssim": statistics.fmean(row["ssim"] for row in rows),
+        "seconds_per_frame": statistics.median(row["seconds"] for row in rows),
+        "rows": rows,
+    }
+
+
+def evaluate_octree(
+    octree: Octree,
+    dataset: Dataset,
+    background: Sequence[float],
+    early_stop_eps: float = DEFAULT_EARLY_STOP,
+    on_view: Callable[[int, Float, Float], None] | None = None,
+    lod: float = DEFAULT_LOD,
+) -> dict[str, Any]:
+    """:func:`score_views` of ``octree``, drawn as ``nerfvol render`` draws it (see render.render_image)."""
+
+    def render(camera: Camera) -> Float:
+        return render_image(octree, camera, background, early_stop_eps, ("rgb",), lod)["rgb"]
+
+    return score_views(render, dataset, background, on_view)

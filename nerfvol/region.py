@@ -1,0 +1,79 @@
+"""The scene's region, in numbers only: an inner cube of detail and, around photographs, shells of doubling cells.
+
+Around the inner cube, ``aabb``'s, each shell reaches twice as far as the one inside it with cells twice as large, so that
+cells look about equally large from the middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nerfvol.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBounds:
+    """Where the scene is, in scene units.
+
+    ``aabb`` (2, 3) float64, lowest and highest corner: the region of detail.
+    ``background_cube`` (2, 3) or None: the larger cube, concentric with ``aabb``, that holds the surroundings of
+    photographs; None where the background is not part of the scene.
+    ``has_alpha``: the images have transparent pixels, seen over whatever background is asked for.
+    """
+
+    aabb: NDArray[np.float64]
+    background_cube: NDArray[np.float64] | None
+    has_alpha: bool
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "aabb", check_box(self.aabb, "the scene's aabb"))
+        if self.background_cube is not None:
+            object.__setattr__(self, "background_cube", check_box(self.background_cube, "the background cube"))
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) the middle of the region of detail."""
+        return self.aabb.mean(axis=0)
+
+    @property
+    def side(self) -> float:
+        """Edge of the inner cube: the longest of the region of detail."""
+        return float((self.aabb[1] - self.aabb[0]).max())
+
+    @property
+    def is_unbounded(self) -> bool:
+        """Whether the surroundings belong to the scene, as in photographs."""
+        return self.background_cube is not None
+
+    @property
+    def n_shells(self) -> int:
+        """How often the inner cube must double to hold the surroundings; 0 where these are not part of the scene."""
+        if self.background_cube is None:
+            return 0
+        around = (self.background_cube[1] - self.background_cube[0]).max()
+        return max(0, int(np.ceil(np.log2(around / self.side) - 1e-6)))
+
+    def finest_levels(self, points: NDArray[np.float64], level: int) -> NDArray[np.int64]:
+        """The finest level of an octree over inner cube and shells at points (n, 3), (n,): ``level`` splits the inner cube
+        into 2**level cells along an edge, and each shell has one level less."""
+        distance = np.abs(points - self.center).max(1) / (self.side / 2)
+        return level + self.n_shells - np.ceil(np.log2(np.maximum(distance, 1))).astype(np.int64)
+
+
+def cube(center: NDArray[np.float64], half: float) -> NDArray[np.float64]:
+    """(2, 3) corners."""
+    return np.stack([center - half, center + half])
+
+
+def check_box(box: ArrayLike, what: str) -> NDArray[np.float64]:
+    """The box (2, 3) float64 from (2, 3) or six numbers; InputError unless finite and not empty on any axis."""
+    corners = np.asarray(box, dtype=np.float64)
+    if corners.size != 6:
+        raise InputError(f"{what} must be two corners of three numbers, got shape {corners.shape}")
+    corners = corners.reshape(2, 3).copy()
+    if not (np.abs(corners) < 1e15).all() or not (corners[0] < corners[1]).all():
+        raise InputError(f"{what} must be finite with its first corner below the second, got {corners.tolist()}")
+    return corners

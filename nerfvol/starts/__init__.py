@@ -1,0 +1,1 @@
+"""What a representation begins from: one file each."""

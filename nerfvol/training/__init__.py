@@ -1,0 +1,1 @@
+"""A training run: its settings, memory, data in tiles, session and trainers."""

@@ -1,0 +1,314 @@
+"""Training of a radiance field from posed images: rays -> samples -> field -> quadrature -> loss, step by step.
+
+Every random number of step k comes from (seed, k), and all that lives between steps is in ``FieldTrainer.state_dict``:
+a run that was stopped and resumed gives the same numbers as one that was not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfvol.config.training import FieldConfig
+from nerfvol.errors import InputError
+from nerfvol.field.fields import Domain, NeuralField, RadianceField, make_field
+from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
+from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
+from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
+
+if TYPE_CHECKING:
+    from nerfvol.cameras.camera import Camera
+    from nerfvol.datasets.dataset import Dataset
+    from nerfvol.region import SceneBounds
+
+
+def domain_of(scene: SceneBounds) -> Domain:
+    """The cube of detail around the scene's bounds, and the background cube around it where there is one."""
+    aabb = np.asarray(scene.aabb, dtype=np.float64)
+    center, half = aabb.mean(0), float((aabb[1] - aabb[0]).max() / 2)
+    if not (math.isfinite(half) and half > 0):
+        raise InputError(f"the scene bounds must be a box of positive size, got {aabb.tolist()}")
+    outer = 1.0
+    if scene.is_unbounded:
+        outer = max(1.0, float(np.abs(np.asarray(scene.background_cube) - center).max() / half))
+    return Domain(tuple(center.tolist()), half, outer)
+
+
+class PixelBank:
+    """All training pixels of one image scale, to draw rays from: uint8 colours and shared pixel directions."""
+
+    def __init__(self, dataset: Dataset, background: Sequence[float], downscale: int) -> None:
+        images = dataset.pyramid(background, downscale)
+        self.colours = torch.from_numpy(np.concatenate([np.asarray(image).reshape(-1, 3) for image in images]))
+        sizes = [image.shape[0] * image.shape[1] for image in images]
+        self.starts = torch.tensor(np.concatenate([[0], np.cumsum(sizes)]))
+        self.intrinsics = [camera.intrinsics.scaled(downscale) for camera in dataset.cameras]
+        poses = np.stack([camera.c2w for camera in dataset.cameras])
+        self.rotations = torch.tensor(poses[:, :3, :3], dtype=torch.float32)
+        self.origins = torch.tensor(poses[:, :3, 3], dtype=torch.float32)
+
+    def rays(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Origins and unit directions (n, 3) of flat pixel numbers over all images; increasing numbers are fastest."""
+        image = torch.searchsorted(self.starts, pixels, right=True) - 1
+        local = (pixels - self.starts[image]).numpy()
+        directions = np.empty((len(local), 3), np.float32)
+        for which in np.unique(image.numpy()):
+            rows = np.flatnonzero(image.numpy() == which)
+            directions[rows] = self.intrinsics[which].directions().reshape(-1, 3)[local[rows]]
+        turned = torch.bmm(self.rotations[image], torch.from_numpy(directions)[..., None])[..., 0]
+        return self.origins[image], turned
+
+    def sample(self, n_rays: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Random pixels: origins, unit directions and colours in [0, 1], each (n_rays, 3) float32."""
+        pixels = torch.randint(len(self.colours), (n_rays,), generator=generator).sort().values
+        rays_o, rays_d = self.rays(pixels)
+        return rays_o, rays_d, self.colours[pixels].float() / 255
+
+
+def importance_samples(
+    field: RadianceField,
+    rays_o: Tensor,
+    rays_d: Tensor,
+    span: tuple[Tensor, Tensor],
+    counts: tuple[int, int],
+    generator: torch.Generator | None = None,
+) -> Samples:
+    """Stratified samples, weighed by the field, then as many again where the weight is (Mildenhall et al. 2020, 5.2).
+
+    One network serves for both passes. Returns the segments between the union of both sets of samples.
+
+    Args:
+        span: near and far distance of each ray, (n,) each.
+        counts: coarse and fine samples of a ray.
+    """
+    near, far = span
+    with torch.no_grad():
+        coarse = stratified(near, far, counts[0], generator)
+        edges = edges_of(coarse, near, far)
+        points = rays_o[:, None] + rays_d[:, None] * coarse[..., None]
+        sigmas = field.density(points.reshape(-1, 3)).view_as(coarse)
+        weights = composite(sigmas, edges.diff(dim=-1)).weights
+        fine = inverse_cdf(edges, weights + 1e-3 / counts[0], counts[1], generator)
+        edges = edges_of(torch.cat([coarse, fine], dim=-1).sort(-1).values, near, far)
+    rays = torch.arange(len(near)).repeat_interleave(edges.shape[1] - 1)
+    return Samples(rays, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1))
+
+
+def shade(field: RadianceField, samples: Samples, rays_o: Tensor, rays_d: Tensor) -> tuple[Tensor, Tensor, Composite]:
+    """Coefficients (n,), colours (n, 3) and compositing of packed samples."""
+    sigmas, rgb = field(samples.positions(rays_o, rays_d), rays_d[samples.ray_indices])
+    parts = composite_packed(sigmas, samples.t_ends - samples.t_starts, samples.ray_indices, len(rays_o))
+    return sigmas, rgb, parts
+
+
+@torch.no_grad()
+def render_field(
+    field: RadianceField,
+    rays_o: Tensor,
+    rays_d: Tensor,
+    background: Sequence[float],
+    find_samples: Any,
+    chunk: int = 4096,
+) -> dict[str, Tensor]:
+    """Images of a field, a chunk of rays at a time so that memory is bounded.
+
+    Args:
+        rays_o, rays_d: (n, 3) float32 (or (3,) for one origin); directions unit.
+        background: RGB.
+        find_samples: callable (rays_o, rays_d) -> Samples, such as ``FieldTrainer.find_samples``.
+        chunk: rays at a time.
+
+    Returns:
+        rgb (n, 3) clipped to [0, 1], opacity (n,), depth (n,) expected distance in u, 0 where nothing is met.
+    """
+    rays_o = rays_o.expand_as(rays_d)
+    back = torch.as_tensor(background, dtype=rays_d.dtype)
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
+    for o, d in zip(rays_o.split(chunk), rays_d.split(chunk), strict=True):
+        samples = find_samples(o, d)
+        rgb, result = _shade_in_pieces(field, samples, o, d)
+        middle = (samples.t_starts + samples.t_ends) / 2
+        summed = accumulate(result.weights, torch.cat([rgb, middle[:, None]], -1), samples.ray_indices, len(o))
+        colour = (summed[:, :3] + result.trans_final[:, None] * back).clamp(0, 1)
+        parts.append((colour, 1 - result.trans_final, summed[:, 3]))
+    rgb, opacity, depth = (torch.cat(column) for column in zip(*parts, strict=True))
+    return {"rgb": rgb, "opacity": opacity, "depth": depth}
+
+
+def _shade_in_pieces(
+    field: RadianceField, samples: Samples, rays_o: Tensor, rays_d: Tensor, piece: int = 65536
+) -> tuple[Tensor, Composite]:
+    """Colours and compositing, the field evaluated for ``piece`` samples at a time: a ray may have hundreds of them."""
+    positions, viewdirs = samples.positions(rays_o, rays_d), rays_d[samples.ray_indices]
+    parts = [field(p, v) for p, v in zip(positions.split(piece), viewdirs.split(piece), strict=True)]
+    sigmas, rgb = (torch.cat(column) for column in zip(*parts, strict=True))
+    return rgb, composite_packed(sigmas, samples.t_ends - samples.t_starts, samples.ray_indices, len(rays_o))
+
+
+class FieldTrainer:
+    """Trains one field on one dataset, a step at a time.
+
+    Args:
+        dataset: posed images.
+        config: see ``FieldConfig``.
+        seed: all randomness.
+        background: RGB that images with alpha are composited on and that lies behind the field.
+    """
+
+    def __init__(
+        self, dataset: Dataset, config: FieldConfig, seed: int = 0, background: Sequence[float] = (1.0, 1.0, 1.0)
+    ) -> None:
+        self.dataset, self.config, self.seed = dataset, config, seed
+        self.background = torch.tensor(background, dtype=torch.float32)
+        self.domain = domain_of(dataset.scene)
+        self.field = make_field(self.domain, config.shape, seed)
+        self.grid = OccupancyGrid(self.domain, config.grid_resolution)
+        self.schedules = [StepSchedule(self.domain, n) for n in config.march_steps]
+        self.schedule = self.schedules[-1]
+        self.optimizer = torch.optim.Adam(
+            self.field.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
+        )
+        self.steps_done = 0
+        self.n_rays = max(1, min(config.max_rays, config.samples_per_step // 64))
+        self._banks: dict[int, PixelBank] = {}
+
+    def find_samples(self, rays_o: Tensor, rays_d: Tensor, generator: torch.Generator | None = None) -> Samples:
+        """Where to look along rays; jittered with a generator, the middles without."""
+        near_plane = self.config.near_fraction * self.domain.half if self.domain.outer > 1 else 0.0
+        if self.config.sampler == "importance":
+            near, far = intersect_aabb(rays_o, rays_d, self.domain.aabb)
+            near = near.clamp(min=near_plane)
+            span, counts = (near, torch.maximum(near, far)), (self.config.n_coarse, self.config.n_fine)
+            return importance_samples(self.field, rays_o, rays_d, span, counts, generator)
+        jitter = None if generator is None else torch.rand(len(rays_o), generator=generator)
+        return self.grid.march(rays_o, rays_d, self.schedule, near_plane, jitter)
+
+    def trained_field(self) -> NeuralField | OccupiedField:
+        """The field without what it holds in space that training skips: what is to be rendered or distilled."""
+        return OccupiedField(self.field, self.grid) if self.config.sampler == "occupancy" else self.field
+
+    def render(self, rays_o: Tensor, rays_d: Tensor, chunk: int = 4096) -> dict[str, Tensor]:
+        """``render_field`` of the field as it is now."""
+        return render_field(self.field, rays_o, rays_d, self.background.tolist(), self.find_samples, chunk)
+
+    def render_camera(self, camera: Camera) -> np.ndarray:
+        """(height, width, 3) float32 image of the field as ``camera`` sees it."""
+        rays_o, rays_d = (torch.from_numpy(rays) for rays in camera.rays())
+        shape = (camera.intrinsics.height, camera.intrinsics.width, 3)
+        return self.render(rays_o, rays_d)["rgb"].numpy().reshape(shape)
+
+    def step(self, progress: float | None = None) -> dict[str, float]:
+        """One optimisation step.
+
+        Args:
+            progress: how much of the run is over, 0 to 1; None = steps done / ``config.steps``.
+
+        Returns:
+            loss, psnr of the batch (dB), samples_per_ray, n_rays, downscale.
+        """
+        config = self.config
+        progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
+        generator = step_generator(self.seed, self.steps_done)
+        self._set_learning_rate(progress)
+        stage = self._stage(progress)
+        bank, self.schedule = self._bank(stage), self.schedules[stage]
+        rays_o, rays_d, target = bank.sample(self.n_rays, generator)
+        samples = self.find_samples(rays_o, rays_d, generator)
+        with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
+            sigmas, rgb, parts = shade(self.field, samples, rays_o, rays_d)
+        colour = accumulate(parts.weights, rgb, samples.ray_indices, self.n_rays)
+        error = (colour + parts.trans_final[:, None] * self.background - target).square().mean()
+        loss = error + self._regularisers(rgb, parts, samples, target, generator)
+        self.optimizer.zero_grad(set_to_none=True)
+        if loss.requires_grad and len(sigmas):
+            loss.backward()
+            self.optimizer.step()
+        self.steps_done += 1
+        n_rays = self.n_rays
+        self._update_grid(samples, rays_o, rays_d, sigmas, generator)
+        self._follow_samples(len(sigmas))
+        mse = max(float(error.detach()), 1e-12)
+        return {
+            "loss": float(loss.detach()),
+            "psnr": -10 * math.log10(mse),
+            "samples_per_ray": len(sigmas) / n_rays,
+            "n_rays": n_rays,
+            "downscale": config.downscales[stage],
+        }
+
+    def _regularisers(
+        self, rgb: Tensor, parts: Composite, samples: Samples, target: Tensor, generator: torch.Generator
+    ) -> Tensor:
+        config, total = self.config, torch.zeros(())
+        if config.colour_weight > 0:
+            apart = (rgb - target[samples.ray_indices]).square().mean(-1)
+            behind = (self.background - target).square().mean(-1)
+            own = (parts.weights * apart).sum() + (parts.trans_final * behind).sum()
+            total = total + config.colour_weight * own / len(target)
+        if config.sparsity_weight > 0:
+            aabb = self.domain.aabb
+            points = aabb[0] + (aabb[1] - aabb[0]) * torch.rand(1024, 3, generator=generator)
+            opacity = -torch.expm1(-self.field.density(points) * self.schedule.step_size)
+            total = total + config.sparsity_weight * opacity.mean()
+        return total
+
+    def _update_grid(
+        self, samples: Samples, rays_o: Tensor, rays_d: Tensor, sigmas: Tensor, generator: torch.Generator
+    ) -> None:
+        if self.config.sampler != "occupancy":
+            return
+        self.grid.update(samples.positions(rays_o, rays_d), sigmas)
+        if self.steps_done % 16 == 0:
+            self.grid.probe(self.field.density, 16384, generator)
+            self.grid.refresh()
+            self.grid.check_not_empty()
+
+    def _follow_samples(self, n_samples: int) -> None:
+        """Choose the next number of rays so that a step has about ``samples_per_step`` samples."""
+        per_ray = n_samples / self.n_rays
+        if self.config.sampler == "importance":
+            per_ray = float(self.config.n_coarse + self.config.n_fine)
+        wanted = self.config.samples_per_step / max(per_ray, 1.0)
+        self.n_rays = max(1, min(self.config.max_rays, int(min(wanted, 1.25 * self.n_rays + 16))))
+
+    def _stage(self, progress: float) -> int:
+        ends = self.config.stage_ends
+        return next((stage for stage, end in enumerate(ends) if progress < end), len(ends) - 1)
+
+    def _bank(self, stage: int) -> PixelBank:
+        downscale = self.config.downscales[stage]
+        if downscale not in self._banks:
+            self._banks = {downscale: PixelBank(self.dataset, self.background.tolist(), downscale)}
+        return self._banks[downscale]
+
+    def _set_learning_rate(self, progress: float) -> None:
+        warm = min(1.0, (self.steps_done + 1) / 20)
+        decay = self.config.final_learning_rate ** max(0.0, (progress - 1 / 3) * 1.5)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * warm * decay
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that lives between steps, as tensors and numbers."""
+        return {
+            "field": self.field.state_dict(),
+            "optimizer": {k: dict(v) for k, v in self.optimizer.state_dict()["state"].items()},
+            "grid": self.grid.state_dict(),
+            "steps_done": self.steps_done,
+            "n_rays": self.n_rays,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of ``state_dict``; InputError where the state is of another network."""
+        try:
+            self.field.load_state_dict(state["field"])
+        except (RuntimeError, KeyError) as error:
+            raise InputError(f"the checkpoint's field does not fit the configured network: {error}") from error
+        moments = {int(k): dict(v) for k, v in state["optimizer"].items()}
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+        self.grid.load_state_dict(state["grid"])
+        self.steps_done, self.n_rays = int(state["steps_done"]), int(state["n_rays"])

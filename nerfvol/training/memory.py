@@ -1,0 +1,193 @@
+"""What training needs of the machine's memory, before it starts: an estimate, a refusal, or a bound on the octree.
+
+The figures are sums of array sizes (docstrings say which), so they hold on any machine; tests compare them with what a
+run really takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.errors import InputError
+from nerfvol.machine import available_memory
+from nerfvol.octree.rows import BLOCKS
+
+BASE_BYTES = 160 << 20
+"""The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
+runs have at their peak beside the arrays named below."""
+FIELD_BYTES = 310 << 20
+"""torch, the code that it compiles and what the training of a field leaves behind: measured."""
+DISTILL_BYTES = 290 << 20
+"""Beside the field and the images: an octree of candidates before and after leaves were merged (0.9 million for lego)."""
+LEAF_BYTES = 32 + 1 + 12 + 12 + 2
+"""Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
+VERTEX_BYTES = 4
+"""Per vertex: a slot (int32), beside two rows of floats."""
+VERTICES_PER_LEAF = 1.65
+"""Vertices of an octree that was split where it pays, for each leaf: measured on lego, 1.5 to 1.7 at every size."""
+BEFORE_SHARE = 0.4
+"""Of the leaves of the largest octree: those that the octree before it had, which is in memory while its leaves are split."""
+RICH_BYTES_PER_PIXEL = 3
+"""Per training pixel in a tile that is not plain background: 8-bit RGB."""
+TILE_BYTES_PER_PIXEL = 0.33
+"""Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool)."""
+LEAVES_PER_PIXEL = 2.2
+"""Leaves of an octree split where it pays, for each pixel of one view: 1.38 million for lego at 800x800. Thick media have
+several times as many."""
+PHOTOGRAPH_LEAVES_PER_PIXEL = 0.8
+"""The same for photographs, whose stages split less: 0.37 million for fox at 540x960."""
+MOST_LEAVES = 1 << 27
+"""Eight corners each are numbered with 31 bits."""
+SHARE = 0.9
+"""Of the memory at hand that a run may plan for."""
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What a run holds beside the octree and its training images.
+
+    rich_share: of the training tiles, those that are not plain background. held_out_bytes: of images. field: whether the
+    octree comes from a field.
+    """
+
+    rich_share: float = 1.0
+    held_out_bytes: int = 0
+    field: bool = False
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Bytes by use; ``leaves`` is the largest number of leaves that was reckoned with.
+
+    Images, octree and change are there at one time, the distillation of a field (0: there is none) at another.
+    """
+
+    base: int
+    images: int
+    octree: int
+    change: int
+    leaves: int
+    distillation: int = 0
+
+    @property
+    def peak(self) -> int:
+        """Everything at its largest."""
+        return self.base + max(self.images + self.octree + self.change, self.distillation)
+
+    def sentence(self) -> str:
+        """The parts in words."""
+        before = f", before that {gib(self.distillation)} to distil the field" if self.distillation else ""
+        return (
+            f"{gib(self.peak)} at its peak: images {gib(self.images)}, an octree of up to {self.leaves:,} leaves "
+            f"{gib(self.octree)}, changing it {gib(self.change)}, the program {gib(self.base)}{before}"
+        )
+
+
+def octree_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> int:
+    """Bytes of an octree under training, with its second moments and statistics; ``vertices`` None: VERTICES_PER_LEAF."""
+    count = VERTICES_PER_LEAF * leaves if vertices is None else vertices
+    return int(LEAF_BYTES * leaves + (VERTEX_BYTES + 2 * row_bytes(sh_degree)) * count)
+
+
+def change_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> int:
+    """Bytes beside an octree that has just been split into so many leaves, while the second moments follow the values.
+
+    Of the octree before: second moments and corners; and where each leaf and vertex came from, 5 bytes each. Pruning the
+    largest octree would take a quarter more, but it has few leaves to lose, and then it is not done (finetune.WORTH_PRUNING).
+    """
+    count = VERTICES_PER_LEAF * leaves if vertices is None else vertices
+    return int(BEFORE_SHARE * (row_bytes(sh_degree) * count + 32 * leaves) + 5 * (leaves + count))
+
+
+def row_bytes(sh_degree: int) -> int:
+    """Bytes of one row of values or second moments."""
+    return 4 * 16 * BLOCKS[sh_degree]
+
+
+def estimate_training(
+    dataset: Dataset, leaves: int, sh_degree: int, beside: Beside | None = None, vertices: int | None = None
+) -> MemoryEstimate:
+    """What training an octree of at most ``leaves`` leaves on ``dataset`` takes.
+
+    ``vertices`` None: VERTICES_PER_LEAF, and an octree that is largest when the training images stand in tiles and their
+    files' pixels were let go; these count where they are more than what the octree still has to grow by, or cannot be let go.
+    With ``vertices`` the octree is there, and so are the images that it has beside it now.
+    """
+    beside = beside or Beside()
+    pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
+    octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
+    growth = 0 if dataset.reload is None or vertices is not None else change + octree // 2
+    tiles = int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
+    return MemoryEstimate(
+        base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
+        images=tiles + beside.held_out_bytes + max(0, dataset.nbytes - growth),
+        octree=octree,
+        change=change,
+        leaves=leaves,
+        distillation=dataset.nbytes + beside.held_out_bytes + DISTILL_BYTES if beside.field else 0,
+    )
+
+
+def require_memory(estimate: MemoryEstimate, available: int | None = None) -> None:
+    """Refuse a run that cannot fit, with what to try. ``available`` defaults to what the machine has free."""
+    free = available_memory() if available is None else available
+    if free is not None and estimate.peak > SHARE * free:
+        raise InputError(
+            f"training would need {estimate.sentence()}, but {gib(free)} of memory are free; "
+            "use a larger --downscale or a smaller octree (its finest level costs most)"
+        )
+
+
+def affordable_leaves(
+    dataset: Dataset, sh_degree: int, least: int = 1 << 18, available: int | None = None, beside: Beside | None = None
+) -> int:
+    """The most leaves with which training fits in the memory at hand; MOST_LEAVES where nobody tells how much that is.
+
+    Raises:
+        InputError: not even ``least`` leaves fit beside the images.
+    """
+    free = available_memory() if available is None else available
+    if free is None:
+        return MOST_LEAVES
+    require_memory(estimate_training(dataset, least, sh_degree, beside), free)
+    low, high = least, MOST_LEAVES
+    while high - low > 1:
+        middle = (low + high) // 2
+        fits = estimate_training(dataset, middle, sh_degree, beside).peak <= SHARE * free
+        low, high = (middle, high) if fits else (low, middle)
+    return low
+
+
+def largest_octree(levels: Sequence[int], view_pixels: int, photographs: bool = False) -> int:
+    """Leaves to reckon with for stages whose finest levels are ``levels``, the first of which is full from the start.
+
+    Splitting every leaf of a trained octree makes about 12 * 4^level. Since only leaves of more than a pixel are split,
+    LEAVES_PER_PIXEL (or PHOTOGRAPH_LEAVES_PER_PIXEL) times the pixels of one view are a bound of their own.
+    """
+    surface = max(min(8**level, 12 * 4**level) for level in levels)
+    per_pixel = PHOTOGRAPH_LEAVES_PER_PIXEL if photographs else LEAVES_PER_PIXEL
+    return max(8 ** levels[0], min(surface, int(per_pixel * view_pixels)))
+
+
+def splits_within(split: np.ndarray, gain: np.ndarray, most: int | None) -> np.ndarray:
+    """``split`` (n,) bool without the leaves whose splitting would make more than ``most`` leaves; None: no bound.
+
+    Each split makes seven more leaves; those of the largest ``gain`` (n,) are kept, the first of equal ones. Says so.
+    """
+    wanted = np.flatnonzero(split)
+    room = len(wanted) if most is None else max(0, (most - len(split)) // 7)
+    if len(wanted) <= room:
+        return split
+    print(f"memory allows {most:,} leaves: {room:,} of {len(wanted):,} leaves are split, those with the largest error")
+    kept = np.zeros(len(split), dtype=bool)
+    kept[wanted[np.argsort(-gain[wanted], kind="stable")[:room]]] = True
+    return kept
+
+
+def gib(size: int) -> str:
+    """Bytes in GiB with two digits."""
+    return f"{size / 2**30:.2f} GiB"

@@ -1,0 +1,285 @@
+"""Optimising the octree: stages from coarse to fine, pruning, subdivision where it pays.
+
+The recipe (docs/performance.md has what each choice is worth): images from small to full size, an octree that starts
+thin and uniform, loses what no ray needs and splits what rays see at more than a pixel and holds most of the error;
+per-sample colour and distortion terms that empty space, smoothness that fades; RMSprop on touched vertices.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfvol.config.training import OctreeConfig
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.tiles import Cursor, TileBank
+from nerfvol.errors import InputError
+from nerfvol.kernels import ops
+from nerfvol.machine import return_free_memory
+from nerfvol.octree.rows import convert_rows
+from nerfvol.octree.topology import Transfer
+from nerfvol.octree.tree import Octree
+from nerfvol.region import SceneBounds
+from nerfvol.starts.fog import thin_octree
+from nerfvol.training.memory import splits_within
+
+BEHIND = 2
+"""Stream of random numbers of the colours behind photographs; TileBank has 0 and 1."""
+WORTH_PRUNING = 0.05
+"""Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
+FINAL_TILES = 4096
+"""Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
+
+
+class OctreeTrainer:
+    """Optimises an octree on a dataset. ``progress`` runs from 0 to 1 and drives every schedule."""
+
+    def __init__(
+        self, dataset: Dataset, background: Sequence[float], config: OctreeConfig, seed: int, octree: Octree | None
+    ):
+        config = config.for_scene(dataset.scene)
+        n = len(config.levels)
+        for name in ("downscales", "until", "tiles", "prunes"):
+            if len(getattr(config, name)) != n:
+                raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
+        self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
+        self.octree = octree if octree is not None else self._thin_start()
+        self.state = ops.TrainState(self.octree)
+        # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
+        self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
+        self.first_stage = self.stage
+        self.step_count = 0
+        self.rich, self.plain = Cursor(), Cursor()
+        self.prunings = 0
+        self.tiles_seen = 0
+        self.bank: TileBank | None = None
+        self.max_leaves: int | None = None
+        """Bound on splitting, where memory is short; None: none."""
+
+    def _thin_start(self) -> Octree:
+        return thin_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
+
+    @property
+    def _start(self) -> float:
+        """The share of the schedule that a given octree skips."""
+        return self.config.until[self.first_stage - 1] if self.first_stage else 0.0
+
+    def state_dict(self) -> dict:
+        """Everything an exact continuation needs: arrays, numbers and strings."""
+        t, s = self.octree, self.state
+        return {
+            "node_mask": t.node_mask, "leaf_mask": t.leaf_mask, "values": t.values, "moments": s.moments,
+            "origin": t.origin, "size": t.size, "density_scale": t.density_scale, "sh_degree": t.sh_degree,
+            "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
+            "stage": self.stage, "first_stage": self.first_stage, "step_count": self.step_count,
+            "prunings": self.prunings, "tiles_seen": self.tiles_seen,
+            "rich": dataclasses.asdict(self.rich), "plain": dataclasses.asdict(self.plain),
+        }  # fmt: skip
+
+    def load_state_dict(self, state: dict) -> None:
+        """Continues from :meth:`state_dict` as if nothing had happened."""
+        octree = Octree(
+            state["node_mask"], state["leaf_mask"], origin=state["origin"], size=state["size"],
+            sh_degree=state["sh_degree"], density_scale=state["density_scale"],
+        )  # fmt: skip
+        if np.shape(state["values"]) != octree.values.shape or np.shape(state["moments"]) != octree.values.shape:
+            raise InputError("checkpoint: values and moments do not fit the octree's topology")
+        octree.values = np.array(state["values"], dtype=np.float32)
+        self.octree = octree
+        self.state = ops.TrainState(octree, np.array(state["moments"], dtype=np.float32))
+        for name in ("max_weight", "error", "footprint"):
+            if np.shape(state[name]) != (octree.n_leaves,):
+                raise InputError(f"checkpoint: {name} does not fit the octree's {octree.n_leaves} leaves")
+            setattr(self.state, name, np.array(state[name], dtype=np.float32))
+        for name in ("stage", "first_stage", "step_count", "prunings", "tiles_seen"):
+            setattr(self, name, int(state[name]))
+        self.rich, self.plain = Cursor(**state["rich"]), Cursor(**state["plain"])
+        # The bank says when enough was seen to prune: where it stood before, it must stand at once.
+        self.bank = None if self.step_count == 0 else self._make_bank()
+
+    def step(self, progress: float) -> ops.StepReport:
+        """One step at ``progress`` in [0, 1] of the run."""
+        c = self.config
+        progress = self._start + progress * (1 - self._start)
+        if progress >= c.until[self.stage] and self.stage + 1 < len(c.levels):
+            if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
+                self.next_stage()
+        self._prune_inside_stage(progress)
+        if self.bank is None:
+            self.bank = self._make_bank()
+        fade = c.regulariser_decay**progress
+        smooth = fade if self.step_count >= c.smooth_from else 0.0
+        terms = c.colour * fade, c.distortion * fade, c.smooth_density * smooth, c.smooth_colour * smooth
+        options = ops.LossOptions(self._behind(), *terms, c.early_stop_eps)
+        late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
+        rate = c.rate_decay**late
+        rates = ops.Rates(c.rate_density * rate, c.rate_dc * rate, c.rate_sh * rate, c.beta)
+        batch = self.bank.draw(c.tiles[self.stage], c.rich_share, self.seed, self.rich, self.plain)
+        report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
+        self.step_count += 1
+        self.tiles_seen += c.tiles[self.stage]
+        return report
+
+    def _behind(self) -> tuple[float, ...]:
+        """What this step's rays see where they leave the octree: the background.
+
+        In photographs another colour each step, for they have none, and nothing in them may rely on one.
+        """
+        if not self.dataset.scene.is_unbounded:
+            return self.background
+        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, BEHIND, self.step_count])))
+        return tuple(random.random(3).tolist())
+
+    def _make_bank(self) -> TileBank:
+        return TileBank(self.dataset, self.background, self.config.downscales[self.stage])
+
+    def next_stage(self) -> None:
+        """Prunes, splits the leaves that the next stage wants finer, and turns to its images."""
+        c = self.config
+        old, self.stage, self.prunings = self.stage, self.stage + 1, 0
+        error, footprint = self.prune()
+        footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
+        fine = c.levels[self.stage] >= c.fine_from
+        for _ in range(1 if fine else c.levels[self.stage]):
+            transfer = self._split(error, footprint, c.subdivide_error if fine else c.coarse_error)
+            if transfer is None:
+                break
+            error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
+        if self.stage + 1 == len(c.levels) and c.final_sh_degree > self.octree.sh_degree:
+            self._grow_sh(c.final_sh_degree)
+        if c.downscales[old] != c.downscales[self.stage]:
+            self.bank = None
+            self.rich, self.plain = Cursor(), Cursor()
+
+    def _split(self, error: np.ndarray, footprint: np.ndarray, share: float) -> Transfer | None:
+        """Splits the leaves that this stage wants finer, among those that hold ``share`` of the error; None: there are none.
+
+        error, footprint (in pixels of this stage's images): (n_leaves,).
+        """
+        c, level = self.config, self.config.levels[self.stage]
+        split = footprint > (c.subdivide_pixels if level >= c.fine_from else c.whole_pixels)
+        split &= self.octree.leaf_level < self.dataset.scene.finest_levels(self.octree.leaf_centers(), level)
+        split &= holds_share(error, share)
+        split = splits_within(split, error, self.max_leaves)
+        return self._change(*self.octree.subdivide(split)) if split.any() else None
+
+    def _grow_sh(self, degree: int) -> None:
+        """The same field with more bands, which begin at zero."""
+        moments = convert_rows(self.state.moments, self.octree.sh_degree, degree)
+        self.octree = self.octree.with_sh_degree(degree)
+        self.state = ops.TrainState(self.octree, moments)
+
+    def _worth_splitting(self, progress: float) -> bool:
+        """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
+        c, stage = self.config, self.stage + 1
+        left = self.step_count * (1 - progress) / max(progress - self._start, 1e-9)
+        return left >= (c.fine_steps if c.levels[stage] >= c.fine_from else c.prunes[stage] * c.prune_steps)
+
+    def _seen_enough(self) -> bool:
+        """Whether the rays since the last pruning can tell what no ray needs."""
+        # Around photographs much is seen at the rim of a few of them only: it takes more tiles to have met it at all.
+        enough = 20_000 if not self.dataset.scene.is_unbounded else 80_000
+        if self.bank is None or self.tiles_seen < self.config.prune_steps * self.config.tiles[self.stage]:
+            return False
+        return self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
+
+    def _prune_inside_stage(self, progress: float) -> None:
+        """Prunes where it is due, and splits where that pays."""
+        c = self.config
+        start = c.until[self.stage - 1] if self.stage else 0.0
+        due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
+        if (
+            self.prunings < c.prunes[self.stage]
+            and progress >= start + due * (c.until[self.stage] - start)
+            and self._seen_enough()
+        ):
+            error, footprint = self.state.error, self.state.footprint
+            if 1 - self._needed(c.prune_weight).mean() >= WORTH_PRUNING:
+                error, footprint = self.prune()
+            if not c.growing_error or self._split(error, footprint, c.growing_error) is None:
+                self._start_anew()
+            self.prunings += 1
+
+    def _needed(self, weight: float) -> np.ndarray:
+        """Which leaves have a largest weight of at least ``weight``, (n_leaves,).
+
+        And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what stands at the
+        rim of a few pictures would be lost for good. They cost no time, and are split no more.
+        """
+        needed = self.state.max_weight >= weight
+        if self.bank is not None and self.config.rich_share * self.tiles_seen < 2 * len(self.bank.rich_tiles):
+            needed |= self.state.footprint == 0
+        return needed
+
+    def _start_anew(self) -> None:
+        """Forgets what rays needed so far."""
+        self.tiles_seen = 0
+        self.state.reset_statistics(self.octree.n_leaves)
+
+    def prune(self) -> tuple[np.ndarray, np.ndarray]:
+        """Removes leaves that no ray needed; error and footprint of those that stay."""
+        keep = self._needed(self.config.prune_weight)
+        if not keep.any():
+            raise InputError(
+                f"the octree collapsed to empty space at step {self.step_count}: no training ray needs any of it; check "
+                "that --background is the images' background and that the scene bounds contain the object, or lower "
+                "octree.colour and octree.distortion"
+            )
+        error, footprint = self.state.error[keep], self.state.footprint[keep]
+        self._change(*self.octree.prune(keep))
+        return error, footprint
+
+    def finish(self) -> Octree:
+        """The octree without the leaves that no picture misses: see ``final_prune_weights``. Ends the training.
+
+        A second octree stands beside the first while they are compared; moments and tiles are let go before.
+        """
+        if self.bank is None or not self._seen_enough():
+            return self.octree
+        rng = np.random.default_rng(self.seed)
+        tiles = self.bank.rich_tiles if len(self.bank.rich_tiles) else self.bank.plain_tiles
+        tiles = rng.choice(tiles, min(len(tiles), FINAL_TILES), replace=False)
+        batch = self.bank.batch(tiles, np.ones(len(tiles), np.float32))
+        needed = [self._needed(weight) for weight in self.config.final_prune_weights]
+        self.bank = None
+        del self.state, tiles
+        return_free_memory()
+        most = self._squared_error(self.octree, batch) * (1 + self.config.final_prune_loss)
+        for keep in needed:
+            if not keep.any():
+                continue
+            pruned = None  # one at a time
+            pruned = self.octree.prune(keep)[0]
+            if self._squared_error(pruned, batch) <= most:
+                return pruned
+        return self.octree
+
+    def _squared_error(self, octree: Octree, batch: ops.Batch) -> float:
+        """Sum over the batch's rays, with their weights, of the squared error of the colours as they are shown."""
+        image = ops.render_rays(octree, batch.rays_o, batch.rays_d, self.background, outputs=("rgb",))["rgb"]
+        difference = np.clip(image, 0, 1) - batch.target
+        return float((difference**2).sum(1, dtype=np.float64) @ batch.weight)
+
+    def _change(self, octree: Octree, transfer: Transfer) -> Transfer:
+        self.octree = octree  # the old values go before the moments follow
+        self.state = ops.TrainState(octree, transfer.vertices(self.state.moments))
+        self.tiles_seen = 0
+        return transfer
+
+
+def holds_share(error: np.ndarray, share: float) -> np.ndarray:
+    """The fewest entries of ``error`` (n,) that together hold ``share`` of its sum: (n,) bool."""
+    order = np.argsort(-error, kind="stable")
+    held = np.cumsum(error[order], dtype=np.float64)
+    chosen = np.zeros(len(error), dtype=bool)
+    chosen[order[: 1 + np.searchsorted(held, share * held[-1])]] = True
+    return chosen
+
+
+def first_stage(config: OctreeConfig, octree: Octree, scene: SceneBounds) -> int:
+    """The first stage whose finest level is the octree's, or the last one."""
+    finest = octree.max_level - scene.n_shells
+    reached = [i for i, level in enumerate(config.levels) if level >= finest]
+    return reached[0] if reached else len(config.levels) - 1
