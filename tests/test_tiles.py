@@ -5,11 +5,11 @@ import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets import tiles
 from nerfvol.datasets.tiles import Cursor, TileBank
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
-from nerfvol.training import tiles
 
 WHITE = (1.0, 1.0, 1.0)
 SCENE = SceneBounds(np.array([[-1.0, -1, -1], [1, 1, 1]]), None, True)

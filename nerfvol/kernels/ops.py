@@ -43,8 +43,8 @@ from nerfvol.octree.tree import Octree
 
 
 __all__ = [
-    "OUTPUTS", "TILE_RAYS", "Batch", "LossOptions", "Rates", "StepReport", "TrainState", "View", "available_isas", "get_threads",
-    "isa", "render_rays", "render_view", "set_isa", "set_threads", "train_step",
+    "OUTPUTS", "TILE_RAYS", "Batch", "LossOptions", "Rates", "StepReport", "TrainState", "View", "available_isas",
+    "get_threads", "isa", "render_rays", "render_view", "set_isa", "set_threads", "train_step",
 ]  # fmt: skip
 
 

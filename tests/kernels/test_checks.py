@@ -204,7 +204,10 @@ def test_a_missing_module_is_said_once_and_everything_runs():
 @pytest.mark.skipif(native_module.native() is None, reason="no compiled kernels")
 def test_compiled_kernels_run_without_torch():
     """Its import takes longer than rendering a picture and a fifth of a small run's memory."""
-    whole_program = "    import nerfvol.training.train, nerfvol.views, nerfvol.measure.scores, nerfvol.config.training as t; t.Config()\n"
+    whole_program = (
+        "    import nerfvol.training.train, nerfvol.views, nerfvol.measure.scores, nerfvol.config.training as t\n"
+        "    t.Config()\n"
+    )
     done = run("    import sys; sys.modules['torch'] = None\n" + whole_program + WHOLE)
     assert done.returncode == 0, done.stderr
 
