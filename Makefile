@@ -19,17 +19,17 @@ test: $(BIN)/python
 # The kernels' tests on a build with address and undefined-behaviour sanitizers.
 sanitize: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]' cmake ninja nanobind
-	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tests/kernels/sanitize.py
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tools/sanitize.py
 
 # The same source built with Clang, no warning allowed, under what tests the kernels; nothing where there is no clang++.
 clang: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]' cmake ninja nanobind
-	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tests/kernels/clang.py
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tools/clang.py
 
 # The package built and used where there is no C++ compiler.
 no-compiler: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
-	$(BIN)/python tests/kernels/no_compiler.py
+	$(BIN)/python tools/no_compiler.py
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

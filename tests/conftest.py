@@ -4,9 +4,9 @@ import os
 from pathlib import Path
 
 import pytest
-from tiny import make_sphere_octree, write_scene
 
 from nerfvol.octree.tree import Octree
+from tests.fixtures.tiny import make_sphere_octree, write_scene
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 

@@ -20,7 +20,7 @@ from data_synth import (
     surfaces,
 )
 from data_synth.scene import Scene
-from tests.helpers.hypothesis_tests import assert_means
+from tests.fixtures.hypothesis_tests import assert_means
 
 HG = phase.henyey_greenstein(0.3)
 SUN = np.array([0.6, 0.0, 0.8])

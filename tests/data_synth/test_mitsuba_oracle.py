@@ -8,7 +8,7 @@ import pytest
 
 from data_synth import Camera, March, Path, lights, look_at, media, phase
 from data_synth.scene import Scene
-from tests.helpers.hypothesis_tests import assert_means
+from tests.fixtures.hypothesis_tests import assert_means
 
 mi = pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install mitsuba")
 

@@ -6,7 +6,7 @@ import pytest
 from data_synth import phase, sggx
 from data_synth.errors import InputError
 from tests.data_synth.kernels import SphereGrid, flake_values, phase_samples, phase_values, unit
-from tests.helpers.hypothesis_tests import assert_histogram, assert_sample_mean
+from tests.fixtures.hypothesis_tests import assert_histogram, assert_sample_mean
 
 WO = unit(0.3, -0.5, 0.8)
 FIBRE = phase.microflakes(sggx.fibre(unit(1, 2, 0.5), 0.4))

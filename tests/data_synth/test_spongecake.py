@@ -6,7 +6,7 @@ import pytest
 from data_synth import sggx, spongecake
 from data_synth.errors import InputError
 from tests.data_synth.kernels import SphereGrid, cake_samples, cake_values, unit
-from tests.helpers.hypothesis_tests import assert_histogram, assert_sample_mean
+from tests.fixtures.hypothesis_tests import assert_histogram, assert_sample_mean
 
 WO = unit(0.4, -0.2, 0.7)
 SKIN = spongecake.layer(0.4, sggx.surface((0, 0, 1), 0.4), 0.9)

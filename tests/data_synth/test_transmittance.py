@@ -7,7 +7,7 @@ from scipy import integrate
 from data_synth import media
 from data_synth.errors import InputError
 from data_synth.transmittance import sample_flights, sample_transmittance
-from tests.helpers.hypothesis_tests import assert_histogram, assert_sample_mean
+from tests.fixtures.hypothesis_tests import assert_histogram, assert_sample_mean
 
 D = np.array([0.6, 0.48, 0.64])
 O = np.array([-0.4, -0.3, -0.35])  # noqa: E741

@@ -9,7 +9,7 @@ from nerfvol.datasets.dataset import NEAR_SHARE, Dataset
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
-from tests.datasets.scenes import random_images, ring
+from tests.fixtures.scenes import random_images, ring
 
 
 def test_a_few_views_come_from_all_around(tiny_scene):

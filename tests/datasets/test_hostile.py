@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
-from tests.datasets import scenes
+from tests.fixtures import scenes
 
 SETTINGS = settings(
     max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -8,7 +8,7 @@ from PIL import Image
 
 from nerfvol.datasets.images import MAX_PIXELS, area_average, composite, composite_average, image_size, read_image
 from nerfvol.errors import InputError
-from tests.datasets.scenes import png_bytes, random_images
+from tests.fixtures.scenes import png_bytes, random_images
 
 BACKGROUNDS = [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.5, 0.123)]
 STRATEGY = st.tuples(st.integers(1, 5), st.integers(5, 23), st.integers(5, 23), st.integers(0, 2**31))

@@ -9,7 +9,7 @@ import pytest
 from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
-from tests.datasets import scenes
+from tests.fixtures import scenes
 
 LENSES = {
     "PINHOLE": replace(scenes.LENS, fy=31.0, cx=11.5),

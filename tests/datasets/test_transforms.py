@@ -11,7 +11,7 @@ from PIL import Image
 from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
-from tests.datasets import scenes
+from tests.fixtures import scenes
 
 DISTORTED = replace(scenes.LENS, fy=31.0, cx=11.2, cy=8.7, k1=0.05, k2=-0.03, k3=0.01, k4=0.002, p1=0.004, p2=-0.002)
 

@@ -12,8 +12,8 @@ from scipy.special import erf
 from nerfvol.kernels import on_torch, ops
 from nerfvol.octree.rows import explin_inverse
 from nerfvol.octree.tree import Octree
-from tests.helpers.gradients import assert_order
-from tests.kernels.trees import unit
+from tests.fixtures.gradients import assert_order
+from tests.fixtures.random_octrees import unit
 
 LEVELS = (3, 4, 5)
 SIDES = [2.0 / 2**level for level in LEVELS]

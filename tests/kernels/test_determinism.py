@@ -6,9 +6,9 @@ import torch
 
 from nerfvol.kernels import on_torch, ops
 from nerfvol.octree.tree import Octree
+from tests.fixtures.random_octrees import camera_tiles, random_octree
 from tests.kernels import rounding
 from tests.kernels.test_ops import BACKGROUND, Case, build, traced
-from tests.kernels.trees import camera_tiles, random_octree
 
 RATES = ops.Rates(density=0.1, dc=0.03, sh=0.01)
 

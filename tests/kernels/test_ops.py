@@ -11,8 +11,8 @@ from nerfvol.kernels import on_torch, ops, reference
 from nerfvol.kernels.state import OUTPUTS
 from nerfvol.octree.rows import sh_slots
 from nerfvol.octree.tree import Octree
+from tests.fixtures.random_octrees import DYADIC, ODD, camera_tiles, lattice_rays, random_octree, scattered_rays, unit
 from tests.kernels import rounding
-from tests.kernels.trees import DYADIC, ODD, camera_tiles, lattice_rays, random_octree, scattered_rays, unit
 
 BACKGROUND = (0.9, 0.2, -0.4)
 KINDS = ["mixed", "full", "single", "sparse"]

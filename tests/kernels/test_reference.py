@@ -9,7 +9,7 @@ import torch
 from nerfvol.kernels import ops, reference
 from nerfvol.octree.rows import explin_inverse
 from nerfvol.octree.tree import Octree
-from tests.kernels.trees import ODD, camera_tiles, lattice_rays, random_octree, scattered_rays, unit
+from tests.fixtures.random_octrees import ODD, camera_tiles, lattice_rays, random_octree, scattered_rays, unit
 
 
 def rays64(o, d) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,9 +9,9 @@ import torch
 from nerfvol.kernels import on_torch, ops, reference
 from nerfvol.octree.rows import sh_slots
 from nerfvol.octree.tree import Octree
+from tests.fixtures.random_octrees import unit
 from tests.kernels import rounding
 from tests.kernels.test_ops import Case, assert_within, build, per_ray, traced
-from tests.kernels.trees import unit
 
 U = rounding.U
 BACKGROUND = (1.0, 0.8, 0.3)

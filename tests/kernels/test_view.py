@@ -7,7 +7,7 @@ from nerfvol.cameras.camera import Intrinsics
 from nerfvol.kernels import ops
 from nerfvol.kernels.state import from_squares, in_squares
 from nerfvol.octree.tree import Octree
-from tests.kernels.trees import DYADIC, ODD, random_octree
+from tests.fixtures.random_octrees import DYADIC, ODD, random_octree
 
 
 def view_of(octree, rng, width, height, focal, away):

@@ -1,6 +1,6 @@
 """Builds the package where there is no C++ compiler and uses it: pip must succeed, the commands must run and say so once.
 
-    python tests/kernels/no_compiler.py      (make no-compiler)
+    python tools/no_compiler.py      (make no-compiler)
 
 The wheel is built by pip in an environment of its own, so this needs pip's package index. The packages that nerfvol
 depends on are those of the Python that runs this.
@@ -15,15 +15,15 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 # The Python that runs this may have compiled kernels installed: they are not of this wheel.
 HIDE_INSTALLED = 'import sys\nsys.modules["_nerfvol_kernels"] = None\n'
 USE = """
 import sys
-sys.path.insert(0, sys.argv[1])
-from tiny import make_sphere_octree
+sys.path.append(sys.argv[1])  # after the wheel: of the checkout, only the tests' sphere is wanted
 from nerfvol.cli import main as cli
-from nerfvol.octree_io import save_octree
+from nerfvol.octree.io import save_octree
+from tests.fixtures.tiny import make_sphere_octree
 
 assert cli.__file__.startswith(sys.argv[2]), cli.__file__
 save_octree("sphere.safetensors", make_sphere_octree(4), {})
@@ -54,7 +54,7 @@ def main() -> int:
         assert not compiled, f"something compiled {compiled}: the compiler was not hidden"
         (site / "sitecustomize.py").write_text(HIDE_INSTALLED)
         environment["PYTHONPATH"] = str(site)
-        command = [sys.executable, "-c", USE, ROOT / "tests", site]
+        command = [sys.executable, "-c", USE, ROOT, site]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         print(done.stdout + done.stderr)
         assert done.returncode == 0, "the package does not run without compiled kernels"

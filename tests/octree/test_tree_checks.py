@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from octrees import ORIGIN, SIZE, given, octrees
 
 import nerfvol.octree.topology as module
 from nerfvol.errors import InputError
 from nerfvol.native import aligned_empty
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
+from tests.fixtures.octrees import ORIGIN, SIZE, given, octrees
 
 
 # ------------------------------------------------------------------ refusals

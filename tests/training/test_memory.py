@@ -5,7 +5,6 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tiny import make_sphere_octree
 
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
@@ -20,6 +19,7 @@ from nerfvol.training.memory import (
     require_memory,
     splits_within,
 )
+from tests.fixtures.tiny import make_sphere_octree
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from tiny import make_sphere_octree
 
 from nerfvol.cameras.paths import default_orbit, orbit_cameras
 from nerfvol.measure import bench, roofline
 from nerfvol.octree.io import save_octree
+from tests.fixtures.tiny import make_sphere_octree
 
 
 @pytest.fixture

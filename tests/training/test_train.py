@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import write_scene
-from tiny_runs import TINY, Pretended, log_of, settings, start
 
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.training import session, train
 from nerfvol.training.prepare import prepare_run
+from tests.fixtures.runs import TINY, Pretended, log_of, settings, start
+from tests.fixtures.tiny import write_scene
 
 
 # ---------------------------------------------------------------- memory

@@ -1,6 +1,6 @@
 """Builds the kernels with the address and undefined-behaviour sanitizers and runs the kernels' tests on them.
 
-    python tests/kernels/sanitize.py      (make sanitize)
+    python tools/sanitize.py      (make sanitize)
 
 Exits with 0 where there is no C++ compiler or no sanitizer runtime: then there is nothing to check.
 """

@@ -142,7 +142,7 @@ def test_the_documented_reader_finds_the_same_leaves(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     octree = make_octree()
     save_octree("octree.safetensors", octree, {})
-    text = (Path(__file__).parents[1] / "docs" / "file_format.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "file_format.md").read_text()
     names: dict = {}
     exec(text.split("```python\n")[1].split("```")[0], names)
     assert names["leaves"] == list(zip(octree.leaf_level.tolist(), morton(octree.leaf_ijk).tolist(), strict=True))

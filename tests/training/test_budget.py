@@ -5,7 +5,6 @@ import re
 import time
 
 import pytest
-from tiny_runs import TINY, Pretended, log_of, settings, start
 
 from nerfvol.cli import main
 from nerfvol.files import run_folder
@@ -13,6 +12,7 @@ from nerfvol.octree.io import load_octree
 from nerfvol.training import session, train
 from nerfvol.training.memory import estimate_training, octree_bytes
 from nerfvol.training.train import OctreePhase
+from tests.fixtures.runs import TINY, Pretended, log_of, settings, start
 
 
 @pytest.mark.parametrize("init", ["direct", "mlp"])

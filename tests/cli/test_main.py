@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import make_sphere_octree, write_scene
 
 import nerfvol
 from nerfvol.cli import main
@@ -18,6 +17,7 @@ from nerfvol.config.training import Config
 from nerfvol.errors import InputError
 from nerfvol.octree.io import save_octree
 from nerfvol.training.prepare import prepare_run
+from tests.fixtures.tiny import make_sphere_octree, write_scene
 
 ROOT = Path(nerfvol.__file__).parents[1]
 

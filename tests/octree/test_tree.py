@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from octrees import ORIGIN, SIZE, given, indices, leaf_sets, octrees
 
 import nerfvol.octree.topology as module
 from nerfvol.native import native
 from nerfvol.octree.rows import BLOCKS, DENSITY_SLOT, EMPTY_DENSITY, explin, explin_inverse, sh_slots
 from nerfvol.octree.topology import MAX_LEVEL, OFFSETS, demorton, morton
 from nerfvol.octree.tree import Octree
+from tests.fixtures.octrees import ORIGIN, SIZE, given, indices, leaf_sets, octrees
 
 UNIT_ROUNDOFF = 2.0**-24  # float32
 

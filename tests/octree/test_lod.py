@@ -14,7 +14,7 @@ from nerfvol.octree.rows import DENSITY_SLOT, explin, explin_inverse
 from nerfvol.octree.topology import OFFSETS, level_starts, place_nodes
 from nerfvol.octree.tree import Octree
 from nerfvol.views import render_image
-from tests.kernels.trees import camera_tiles, random_octree
+from tests.fixtures.random_octrees import camera_tiles, random_octree
 
 
 def cube(level: int, scale: float = 1.0, degree: int = 1) -> Octree:

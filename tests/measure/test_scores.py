@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from tiny import make_sphere_octree
 
 from nerfvol.datasets.load import load_dataset
 from nerfvol.measure.scores import LARGEST_PSNR, evaluate_octree, score_views
 from nerfvol.octree.io import save_octree
+from tests.fixtures.tiny import make_sphere_octree
 
 
 @pytest.fixture(scope="module")

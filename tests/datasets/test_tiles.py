@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets import tiles
+from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.tiles import Cursor, TileBank
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.native import native

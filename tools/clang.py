@@ -1,6 +1,6 @@
 """Builds the kernels with Clang, no warning allowed, and runs what tests them, on every instruction set of this machine.
 
-    python tests/kernels/clang.py      (make clang)
+    python tools/clang.py      (make clang)
 
 CXX names another Clang than clang++. Exits with 0 where there is none: then there is nothing to check.
 """
@@ -13,7 +13,7 @@ import sys
 
 from own_build import build_kernels, run_tests
 
-TESTS = ("kernels", "test_lod.py", "test_octree.py", "test_render.py", "test_tiles.py")
+TESTS = ("kernels", "octree", "test_views.py", "datasets/test_tiles.py")
 
 
 def main() -> int:

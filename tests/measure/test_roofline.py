@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from tiny import make_sphere_octree
 
 from nerfvol.cameras.paths import default_orbit, orbit_cameras
 from nerfvol.measure import roofline
 from nerfvol.measure.roofline import Machine, Work
 from nerfvol.octree.tree import Octree
+from tests.fixtures.tiny import make_sphere_octree
 
 
 def crossings(octree: Octree, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_runs import TINY, log_of, metrics_of, product, settings, start
 
 import nerfvol
 from nerfvol.cli import main
@@ -24,6 +23,7 @@ from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.octree.io import load_octree
 from nerfvol.training import session
+from tests.fixtures.runs import TINY, log_of, metrics_of, product, settings, start
 
 ROOT = Path(nerfvol.__file__).parents[1]
 
