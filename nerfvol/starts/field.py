@@ -28,11 +28,12 @@ from nerfvol.errors import InputError
 from nerfvol.field.fields import Domain, RadianceField, SHField
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
-from nerfvol.measure.scores import evaluate_octree, score_views
+from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.octree.merge import merge_smooth
 from nerfvol.octree.rows import EMPTY_DENSITY, explin_inverse
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
+from nerfvol.views import OctreeModel
 
 _CHUNK = 32768  # points of one evaluation of the field
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
@@ -115,7 +116,7 @@ def distill(
     if render_field is not None:
         few = dataset.evenly(config.compare_views).smaller(config.compare_downscale, background)
         field_psnr = score_views(render_field, few, background)["psnr"]
-        octree_psnr = evaluate_octree(octree, few, background)["psnr"]
+        octree_psnr = evaluate(OctreeModel(octree), few, background)["psnr"]
     levels, counts = np.unique(octree.leaf_level, return_counts=True)
     report = DistillReport(
         leaves=octree.n_leaves, vertices=octree.n_vertices,
@@ -159,7 +160,7 @@ class Frame:
 
 
 @torch.no_grad()
-def evaluate(function: Callable[[Tensor], Tensor], positions: np.ndarray) -> np.ndarray:
+def in_chunks(function: Callable[[Tensor], Tensor], positions: np.ndarray) -> np.ndarray:
     """``function`` of positions (n, 3), in chunks; the result as one array of n rows."""
     points = torch.from_numpy(np.ascontiguousarray(positions, dtype=np.float32))
     return torch.cat([function(part) for part in points.split(_CHUNK)]).numpy()
@@ -229,7 +230,7 @@ def largest_sigma(field: RadianceField, corners: np.ndarray, edge: float, per_ax
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     best = np.zeros(len(corners), dtype=np.float32)
     for offset in offsets:
-        np.maximum(best, evaluate(field.density, corners + offset), out=best)
+        np.maximum(best, in_chunks(field.density, corners + offset), out=best)
     return best
 
 
@@ -271,7 +272,7 @@ def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int =
         part = slice(start, start + _CHUNK)
         sigma_sum = sh_sum = 0.0
         for offset in offsets:
-            rows = evaluate(to_sh, positions[part] + spacing[part, None] * offset).astype(np.float64)
+            rows = in_chunks(to_sh, positions[part] + spacing[part, None] * offset).astype(np.float64)
             sigma_sum = sigma_sum + rows[:, 0]
             sh_sum = sh_sum + (rows[:, :1] + 1e-6) * rows[:, 1:]
         sh[part] = sh_sum / (sigma_sum + 1e-6 * len(offsets))[:, None]
