@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 
 from data_synth import media
-from data_synth.bench import SUN, cumulus
 from data_synth.errors import InputError
 from data_synth.integrators import Path
+from data_synth.scene import Scene
 
 SIZE, DEPTH, RUNS = 256, 64, 5
 
@@ -73,13 +73,12 @@ def row(name: str, spp: int, render: Callable[[int], np.ndarray]) -> None:
     )
 
 
-def main() -> None:
+def main(scene: Scene) -> None:
     """Path tracing to 64 events by data_synth and by Mitsuba's variants, in one run."""
     try:
         import mitsuba as mi
     except ImportError as error:
         raise InputError("bench mitsuba: mitsuba is not installed, expected 'pip install mitsuba'") from error
-    scene = cumulus(SUN)
     camera = scene.viewpoints.camera(-55, 22, SIZE, SIZE)
     print(f"\npath tracing to {DEPTH} events, one sun, {SIZE}x{SIZE}; Mitsuba {mi.__version__} volpath")
     print("| renderer | paths a pixel | wall s | CPU s | mean | variance of a pixel | variance × CPU s |")

@@ -50,9 +50,7 @@ def render_view(scene, camera: Camera, integrator=None, seed: int = 0) -> Pictur
 def split_cameras(scene, views: int, size: tuple[int, int], seed: int) -> dict[str, list[Camera]]:
     """Disjoint camera sets by split: spirals over the scene's viewing band, turned differently for each split."""
     counts = {"train": views, "val": max(1, views // 20), "test": max(2, views // 8)}
-    return {
-        split: scene.viewpoints.spread(n, *size, seed=3 * seed + k) for k, (split, n) in enumerate(counts.items())
-    }
+    return {split: scene.viewpoints.spread(n, *size, seed=3 * seed + k) for k, (split, n) in enumerate(counts.items())}
 
 
 def write_dataset(scene, out_dir, options: Options | None = None) -> Path:

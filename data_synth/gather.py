@@ -25,9 +25,9 @@ from data_synth.cameras import pixel_ray
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
 from data_synth.media import BRICK, GRID, Medium, box_interval, lookup
-from data_synth.scene import World, blocked, has_surfaces
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, mul, sub, unit
+from data_synth.world import World, blocked, has_surfaces
 
 OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
 SIDE = BRICK + 1

@@ -64,9 +64,7 @@ def projected_area(s, w):
 
 @jit
 def determinant(s):
-    return (
-        s[0] * s[1] * s[2] + 2.0 * s[3] * s[4] * s[5] - s[0] * s[5] * s[5] - s[1] * s[4] * s[4] - s[2] * s[3] * s[3]
-    )
+    return s[0] * s[1] * s[2] + 2.0 * s[3] * s[4] * s[5] - s[0] * s[5] * s[5] - s[1] * s[4] * s[4] - s[2] * s[3] * s[3]
 
 
 @jit

@@ -142,9 +142,7 @@ def radiance(haze, ox, oy, oz, dx, dy, dz):
     """The emission-absorption integral along one ray: premultiplied r, g, b, then alpha and sum_i w_i t_i."""
     t_hit, which = sphere_trace(ox, oy, oz, dx, dy, dz)
     reach, half = haze.radius + 3.0 * haze.width, 3.0 * haze.width + 0.10
-    t0, t1 = box_interval(
-        ox, oy, oz, dx, dy, dz, -reach, -reach, haze.height - half, reach, reach, haze.height + half
-    )
+    t0, t1 = box_interval(ox, oy, oz, dx, dy, dz, -reach, -reach, haze.height - half, reach, reach, haze.height + half)
     t1 = min(t1, t_hit)
     r, g, b, far, trans = 0.0, 0.0, 0.0, 0.0, 1.0
     if t1 > t0:

@@ -14,6 +14,8 @@ from data_synth.scenes.procedural import fill_fireball, fill_plume
 from data_synth.volumes import read_volume
 
 CLOUD_PHASE = phase.two_lobes(0.6, -0.25, 0.6)
+EVENING_SUN = lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5))
+EVENING_SKY = lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5))
 
 
 def cloud(
@@ -27,15 +29,20 @@ def cloud(
     medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
-        lights=[
-            lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5)),
-            lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5)),
-        ],
+        lights=[EVENING_SUN, EVENING_SKY],
         viewpoints=Viewpoints(radius=4.6, elevation=(-5, 60), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([lo, hi]),
         exposure=0.62,
     )
+
+
+def cumulus(*lit: np.ndarray, resolution: int = 128) -> Scene:
+    """The cloud of the benchmarks: a cube of samples, 22/u, albedo 0.99, Henyey-Greenstein g = 0.7."""
+    lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
+    rho = clouds.cloud("cumulus", (resolution,) * 3, 0.95, 1.0, 0.3, 0)
+    medium = media.grid(rho, lo, hi, 22.0, 0.99, phase=phase.henyey_greenstein(0.7))
+    return Scene("cumulus", medium, lights=list(lit), viewpoints=Viewpoints(radius=4.6), exposure=0.62)
 
 
 def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int = 128, seed: int = 3) -> Scene:
