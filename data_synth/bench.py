@@ -22,7 +22,7 @@ import numpy as np
 from data_synth import bench_mitsuba, scenes
 from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError
-from data_synth.image import linear_to_srgb, write_png
+from data_synth.image import Picture, linear_to_srgb, write_png
 from data_synth.integrators import DeepShadow, March, Path, Preview
 from data_synth.jit import core_count
 from data_synth.scene import Scene
@@ -54,7 +54,10 @@ def single_scattering(title: str, scene: Scene, size: int, beams: int, repeats: 
         "deep, map of 96": DeepShadow(beams=beams, resolution=96),
         "deep, map of 192": DeepShadow(beams=beams, resolution=192),
     }
-    fine = replace(scene, medium=scene.medium._replace(step=scene.medium.step / 4))
+    medium = scene.medium
+    if medium is None:
+        raise InputError(f"bench: expected a scene with a medium, {scene.name} has none")
+    fine = replace(scene, medium=medium._replace(step=medium.step / 4))
     truth = March(beams=beams).render(fine, camera).rgb
     print(f"\n{title}, {size}x{size}, median of {repeats}")
     print("| method | wall s | CPU s | view CPU s | faster, wall | faster, CPU | error | rms | bias |")
@@ -63,7 +66,7 @@ def single_scattering(title: str, scene: Scene, size: int, beams: int, repeats: 
     for name, method in methods.items():
         method.render(scene, coarse)
 
-        def anew(method=method):
+        def anew(method: March = method) -> Picture:
             scene.prepared.clear()
             return method.render(scene, camera)
 
@@ -93,7 +96,7 @@ def preview() -> None:
     scene = cumulus(EVENING_SUN, EVENING_SKY)
     camera = scene.viewpoints.camera(-55, 22, 160, 160)
     truth = Path(spp=128, max_depth=64).render(scene, camera)
-    rgb, spread = truth.rgb, np.sqrt(truth.variance.mean()) / truth.rgb.mean()
+    rgb, spread = truth.rgb, np.sqrt(0.0 if truth.variance is None else truth.variance.mean()) / truth.rgb.mean()
     print(f"\npreview, 160x160; truth: path, 128 paths a pixel, 64 events, noise {spread:.1%} of the mean a pixel")
     print(
         "| method | CPU s | error | rms | bias | error at the best exposure | correlation |\n|---|---|---|---|---|---|---|"

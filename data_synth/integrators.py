@@ -11,8 +11,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -30,6 +31,12 @@ if TYPE_CHECKING:
     from data_synth.scene import Scene
 
 MAP_RESOLUTION = 96  # samples along the longest side of a deep shadow map, unless told otherwise
+
+
+class Integrator(Protocol):
+    """What the table's classes have in common."""
+
+    def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture: ...
 
 
 @dataclass(frozen=True)
@@ -127,10 +134,12 @@ class Path:
         return Picture(out[..., :3], out[..., 3], out[..., 4], out[..., 5:8], self.spp)
 
 
-INTEGRATORS = {"emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview}
+INTEGRATORS: dict[str, Callable[..., Integrator]] = {
+    "emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview,
+}  # fmt: skip
 
 
-def make(name: str, **options):
+def make(name: str, **options: object) -> Integrator:
     """The integrator called ``name``; options None are left at their defaults."""
     if name not in INTEGRATORS:
         raise InputError(f"--integrator: expected one of {', '.join(INTEGRATORS)}, got '{name}'")
@@ -146,7 +155,7 @@ class Prepared(NamedTuple):
     gathered: Gathered | None
 
 
-def _prepared(integrator, scene: Scene) -> Prepared:
+def _prepared(integrator: March | Path, scene: Scene) -> Prepared:
     """Arrays and shadow maps of a scene for an integrator, kept on the scene: they do not depend on the camera."""
     store = scene.prepared
     if integrator not in store:

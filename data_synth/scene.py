@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import lights as lamps
 from data_synth import materials as stuff
@@ -14,7 +16,7 @@ from data_synth import media, surfaces, volumes
 from data_synth.cameras import Camera, Viewpoints
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
-from data_synth.integrators import Prepared, make
+from data_synth.integrators import Integrator, Prepared, make
 from data_synth.world import World
 
 NOTHING = media.homogeneous((-1e-3,) * 3, (1e-3,) * 3, sigma_t=0.0)
@@ -65,7 +67,7 @@ class Scene:
             self.bounded,
         )
 
-    def render(self, camera: Camera, integrator=None, seed: int = 0) -> Picture:
+    def render(self, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
         """One view, by default with the scene's own choice of integrator."""
         return (integrator or make(self.integrators[0])).render(self, camera, seed=seed)
 
@@ -75,5 +77,5 @@ class Scene:
             volumes.write_density(self.medium, out_dir)
 
 
-def _table(rows, width: int) -> np.ndarray:
+def _table(rows: Sequence[ArrayLike], width: int) -> np.ndarray:
     return np.array(rows, dtype=float).reshape(-1, width)

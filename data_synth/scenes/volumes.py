@@ -25,7 +25,10 @@ def cloud(
     """a cumulus at sunset: warm sun from the side, blue sky above"""
     lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
     shape = (resolution, resolution, int(resolution * 1.7 / 2.6))
-    rho, lo, hi = _imported(volume, clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed), lo, hi)
+    if volume is None:
+        rho = clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed)
+    else:
+        rho, lo, hi = _imported(volume, lo, hi)
     medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
@@ -89,7 +92,7 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
         detail = cloud_textures(seed, 64).base
         in_bands(lambda a, b: fill_plume(detail, rho, a, b), rho.shape[0], 4)
     else:
-        rho, lo, hi = _imported(volume, None, lo, hi, up="y")
+        rho, lo, hi = _imported(volume, lo, hi, up="y")
     medium = media.grid(rho, lo, hi, density, (0.92, 0.90, 0.88), phase=phase.henyey_greenstein(0.3))
     return Scene(
         medium=medium,
@@ -127,7 +130,7 @@ def phantom(density: float = 40.0, resolution: int = 128, volume: str | None = N
         lo, hi = (-0.8, -1.0, -0.8), (0.8, 1.0, 0.8)
         value = _head(resolution)
     else:
-        value, lo, hi = _imported(volume, None, (-1.1,) * 3, (1.1,) * 3)
+        value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3)
     # tissue value -> opacity and colour: (value, extinction, r, g, b)
     points = np.array(
         [
@@ -157,7 +160,7 @@ def _head(n: int) -> np.ndarray:
     """Ellipsoids after Shepp & Logan, as tissue values in [0, 1] with soft edges."""
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij", sparse=True)
 
-    def ball(cx, cy, cz, rx, ry, rz):
+    def ball(cx: float, cy: float, cz: float, rx: float, ry: float, rz: float) -> np.ndarray:
         r = np.sqrt(((x - cx) / rx) ** 2 + ((y - cy) / ry) ** 2 + ((z - cz) / rz) ** 2)
         return np.clip((1.0 - r) * min(rx, ry, rz) * n / 5.0 + 0.5, 0.0, 1.0)
 
@@ -174,10 +177,10 @@ def _head(n: int) -> np.ndarray:
     return np.clip(value * cut, 0, 1)
 
 
-def _imported(volume: str | None, default, lo, hi, up: str = "z") -> tuple:
-    """The volume file's samples scaled to [0, 1] in a box as large as lo..hi allows, or the default."""
-    if volume is None:
-        return default, lo, hi
+def _imported(
+    volume: str, lo: media.Point, hi: media.Point, up: str = "z"
+) -> tuple[np.ndarray, media.Point, media.Point]:
+    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows."""
     values, spacing = read_volume(volume)
     if up == "y":  # right-handed: x, y, z -> x, -z, y
         values, spacing = values[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]
