@@ -15,28 +15,18 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path as FilePath
+from dataclasses import replace
 
 import numpy as np
 
-from data_synth import clouds, lights, media, phase
-from data_synth.cameras import Viewpoints
+from data_synth import bench_mitsuba, scenes
+from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError
-from data_synth.image import linear_to_srgb, write_png
+from data_synth.image import Picture, linear_to_srgb, write_png
 from data_synth.integrators import DeepShadow, March, Path, Preview
 from data_synth.jit import core_count
 from data_synth.scene import Scene
-
-SUN = lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5))
-SKY = lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5))
-
-
-def cumulus(*lit: np.ndarray) -> Scene:
-    """A 128^3 cumulus, 22/u, albedo 0.99, Henyey-Greenstein g = 0.7."""
-    lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
-    rho = clouds.cloud("cumulus", (128, 128, 128), 0.95, 1.0, 0.3, 0)
-    medium = media.grid(rho, lo, hi, 22.0, 0.99, phase=phase.henyey_greenstein(0.7))
-    return Scene("cumulus", medium, lights=list(lit), viewpoints=Viewpoints(radius=4.6), exposure=0.62)
+from data_synth.scenes.volumes import EVENING_SKY, EVENING_SUN, cumulus
 
 
 def seconds(work: Callable[[], object], repeats: int) -> tuple[float, float]:
@@ -55,19 +45,19 @@ def errors(picture: np.ndarray, truth: np.ndarray) -> tuple[float, float, float]
     return np.abs(d).mean() / mean, np.sqrt((d**2).mean()) / mean, d.mean() / mean
 
 
-def single_scattering(title: str, size: int, beams: int, *lit: np.ndarray, repeats: int = 3) -> None:
+def single_scattering(title: str, scene: Scene, size: int, beams: int, repeats: int = 3) -> None:
     """Rows of a table: shadow rays and deep shadow maps of several kinds, with time and error."""
-    scene = cumulus(*lit)
-    camera = scene.viewpoints.camera(-55, 22, size, size)
-    coarse = cumulus(*lit).viewpoints.camera(-55, 22, 4, 4)
+    camera, coarse = (scene.viewpoints.camera(-55, 22, side, side) for side in (size, 4))
     methods = {
         "shadow rays": March(beams=beams),
         "deep, gathered at the density": DeepShadow(beams=beams),
         "deep, map of 96": DeepShadow(beams=beams, resolution=96),
         "deep, map of 192": DeepShadow(beams=beams, resolution=192),
     }
-    fine = cumulus(*lit)
-    fine.medium = fine.medium._replace(step=fine.medium.step / 4)
+    medium = scene.medium
+    if medium is None:
+        raise InputError(f"bench: expected a scene with a medium, {scene.name} has none")
+    fine = replace(scene, medium=medium._replace(step=medium.step / 4))
     truth = March(beams=beams).render(fine, camera).rgb
     print(f"\n{title}, {size}x{size}, median of {repeats}")
     print("| method | wall s | CPU s | view CPU s | faster, wall | faster, CPU | error | rms | bias |")
@@ -76,8 +66,8 @@ def single_scattering(title: str, size: int, beams: int, *lit: np.ndarray, repea
     for name, method in methods.items():
         method.render(scene, coarse)
 
-        def anew(method=method):
-            scene.__dict__.pop("_prepared", None)
+        def anew(method: March = method) -> Picture:
+            scene.prepared.clear()
             return method.render(scene, camera)
 
         wall, cpu = seconds(anew, repeats)
@@ -93,20 +83,20 @@ def single_scattering(title: str, size: int, beams: int, *lit: np.ndarray, repea
 
 def one() -> None:
     """One sun."""
-    single_scattering("one sun", 256, 1, SUN)
+    single_scattering("one sun", cumulus(EVENING_SUN), 256, 1)
 
 
 def sky() -> None:
     """A sun and a sky of 12 beams."""
-    single_scattering("a sun and a sky of 12 beams", 64, 12, SUN, SKY, repeats=1)
+    single_scattering("a sun and a sky of 12 beams", cumulus(EVENING_SUN, EVENING_SKY), 64, 12, repeats=1)
 
 
 def preview() -> None:
     """The cloud preview and single scattering against the truth, and the three pictures side by side."""
-    scene = cumulus(SUN, SKY)
+    scene = cumulus(EVENING_SUN, EVENING_SKY)
     camera = scene.viewpoints.camera(-55, 22, 160, 160)
     truth = Path(spp=128, max_depth=64).render(scene, camera)
-    rgb, spread = truth.rgb, np.sqrt(truth.variance.mean()) / truth.rgb.mean()
+    rgb, spread = truth.rgb, np.sqrt(0.0 if truth.variance is None else truth.variance.mean()) / truth.rgb.mean()
     print(f"\npreview, 160x160; truth: path, 128 paths a pixel, 64 events, noise {spread:.1%} of the mean a pixel")
     print(
         "| method | CPU s | error | rms | bias | error at the best exposure | correlation |\n|---|---|---|---|---|---|---|"
@@ -132,21 +122,16 @@ def preview() -> None:
 
 
 def views() -> None:
-    """The command that writes 100 views of the cumulus, from its first to its last file."""
-    from data_synth.cli import main
-
+    """A folder of 100 views of a cumulus at sunset, from the making of the cloud to the last file."""
+    options = Options(views=100, size=(400, 400))
     with tempfile.TemporaryDirectory() as folder:
-        wall, cpu = seconds(
-            lambda: main(["cloud", "--out", str(FilePath(folder) / "out"), "--views", "100", "--size", "400x400"]), 1
-        )
+        wall, cpu = seconds(lambda: write_dataset(scenes.cloud(), folder, options), 1)
     print(f"117 views (100 training, 5 validation, 12 testing): {wall:.1f} s, {cpu:.1f} CPU s")
 
 
 def mitsuba() -> None:
     """Path tracing side by side with Mitsuba 3."""
-    from data_synth.bench_mitsuba import main
-
-    main()
+    bench_mitsuba.main(cumulus(EVENING_SUN))
 
 
 BENCHES = {"one": one, "sky": sky, "preview": preview, "views": views, "mitsuba": mitsuba}

@@ -8,20 +8,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from data_synth import media
-from data_synth.bench import SUN, cumulus
+from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.integrators import Path
+from data_synth.scene import Scene
 
 SIZE, DEPTH, RUNS = 256, 64, 5
 
 
-def theirs(mi, scene, camera, spp: int):
+def theirs(mi: ModuleType, scene: Scene, camera: Camera, spp: int) -> Any:
     """The scene as Mitsuba's, for the variant that is set."""
     m, t = scene.medium, mi.ScalarTransform4f
+    if m is None:
+        raise InputError(f"bench mitsuba: expected a scene with a medium, {scene.name} has none")
     lo, hi, n = np.array(m.lo), np.array(m.hi), np.array(m.cells) + 1
     middle, half = (lo + hi) / 2, (hi - lo) / 2
     # their samples stand at the centres of cells, ours at the corners of the box
@@ -73,13 +78,12 @@ def row(name: str, spp: int, render: Callable[[int], np.ndarray]) -> None:
     )
 
 
-def main() -> None:
+def main(scene: Scene) -> None:
     """Path tracing to 64 events by data_synth and by Mitsuba's variants, in one run."""
     try:
         import mitsuba as mi
     except ImportError as error:
         raise InputError("bench mitsuba: mitsuba is not installed, expected 'pip install mitsuba'") from error
-    scene = cumulus(SUN)
     camera = scene.viewpoints.camera(-55, 22, SIZE, SIZE)
     print(f"\npath tracing to {DEPTH} events, one sun, {SIZE}x{SIZE}; Mitsuba {mi.__version__} volpath")
     print("| renderer | paths a pixel | wall s | CPU s | mean | variance of a pixel | variance × CPU s |")
@@ -92,4 +96,4 @@ def main() -> None:
         except ImportError as error:
             print(f"{variant} cannot be used: {error}")
             continue
-        row(variant, spp, lambda seed, loaded=loaded: np.array(mi.render(loaded, seed=seed))[..., :3])
+        row(variant, spp, lambda seed, loaded=loaded: np.array(mi.render(loaded, seed=mi.UInt32(seed)))[..., :3])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
 from data_synth.jit import jit
@@ -76,7 +77,7 @@ def pixel_ray(camera, x, y):
     return dx * s, dy * s, dz * s
 
 
-def look_at(eye, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0)) -> np.ndarray:
+def look_at(eye: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), up: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
     """Camera-to-world (4, 4) of a camera at ``eye`` looking at ``target``, its y axis as close to ``up`` as can be."""
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     back = eye - target

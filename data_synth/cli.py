@@ -7,13 +7,15 @@ import ast
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from data_synth import integrators, scenes
-from data_synth.dataset import Options, render_view, write_dataset
+from data_synth.dataset import Options, Renderable, render_view, write_dataset
 from data_synth.errors import InputError
 from data_synth.image import write_png
+from data_synth.integrators import Integrator
 
 
 def parser() -> argparse.ArgumentParser:
@@ -58,8 +60,8 @@ def _list() -> int:
     return 0
 
 
-def _parameters(args) -> dict:
-    parameters = {}
+def _parameters(args: argparse.Namespace) -> dict[str, Any]:
+    parameters: dict[str, Any] = {}
     for item in args.set:
         key, equals, value = item.partition("=")
         if not equals:
@@ -82,7 +84,7 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _render(args) -> int:
+def _render(args: argparse.Namespace) -> int:
     if not args.out and not args.picture:
         raise InputError("--out: expected a folder to write, got nothing")
     started = time.perf_counter()
@@ -110,7 +112,7 @@ def _render(args) -> int:
     return 0
 
 
-def _portrait(scene, integrator, size: tuple[int, int], args) -> int:
+def _portrait(scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace) -> int:
     """One view from the middle of the scene's viewing band, over a pale backdrop that darkens downwards."""
     if Path(args.picture).suffix not in (".jpg", ".png"):
         raise InputError(f"--picture: expected a name that ends in .jpg or .png, got {args.picture}")

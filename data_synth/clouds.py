@@ -9,6 +9,7 @@ and the detail is looked up at a place that curl noise has distorted.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def _fill(t, kind, coverage, frequency, erosion, out, first, last):
 
 
 def cloud(
-    kind: str, shape, coverage: float = 0.8, frequency: float = 1.0, erosion: float = 0.3, seed: int = 0,
+    kind: str, shape: Sequence[int], coverage: float = 0.8, frequency: float = 1.0, erosion: float = 0.3, seed: int = 0,
     textures: CloudTextures | None = None,
 ) -> np.ndarray:  # fmt: skip
     """(nx, ny, nz) float32 cloud fraction in [0, 1]. kind: stratus, cumulus or cumulonimbus; coverage in [0, 1]."""

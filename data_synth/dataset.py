@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import platform
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from data_synth.cameras import Camera
+from data_synth.cameras import Camera, Viewpoints
 from data_synth.errors import InputError
 from data_synth.image import Picture, replacing, write_exr, write_png
+from data_synth.integrators import Integrator
+from data_synth.scene import Scene
 
 
 @dataclass
@@ -31,7 +35,7 @@ class Options:
     views: int = 60
     size: tuple[int, int] = (400, 400)
     seed: int = 0
-    integrator: object | None = None
+    integrator: Integrator | None = None
     exr: bool = False
     progress: Callable[[int, int], None] | None = None
 
@@ -42,20 +46,35 @@ class Options:
             raise InputError(f"--size: expected 1 to 16384 pixels a side, got {self.size[0]}x{self.size[1]}")
 
 
-def render_view(scene, camera: Camera, integrator=None, seed: int = 0) -> Picture:
+class Renderable(Protocol):
+    """What a folder of pictures is made of: a ``Scene``, or anything else that renders itself."""
+
+    name: str
+    viewpoints: Viewpoints
+    aabb: np.ndarray
+    integrators: tuple[str, ...]
+    exposure: float
+    parameters: dict
+
+    def render(self, camera: Camera) -> Picture: ...
+
+
+def render_view(scene: Renderable, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
     """One view of any scene: by ``integrator`` if given, else the way the scene prefers."""
-    return scene.render(camera) if integrator is None else integrator.render(scene, camera, seed=seed)
+    if integrator is None:
+        return scene.render(camera)
+    if not isinstance(scene, Scene):
+        raise InputError(f"--integrator: the {scene.name} renders itself, got {integrator}")
+    return integrator.render(scene, camera, seed=seed)
 
 
-def split_cameras(scene, views: int, size: tuple[int, int], seed: int) -> dict[str, list[Camera]]:
+def split_cameras(scene: Renderable, views: int, size: tuple[int, int], seed: int) -> dict[str, list[Camera]]:
     """Disjoint camera sets by split: spirals over the scene's viewing band, turned differently for each split."""
     counts = {"train": views, "val": max(1, views // 20), "test": max(2, views // 8)}
-    return {
-        split: scene.viewpoints.spread(n, *size, seed=3 * seed + k) for k, (split, n) in enumerate(counts.items())
-    }
+    return {split: scene.viewpoints.spread(n, *size, seed=3 * seed + k) for k, (split, n) in enumerate(counts.items())}
 
 
-def write_dataset(scene, out_dir, options: Options | None = None) -> Path:
+def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Options | None = None) -> Path:
     """Render every split of ``scene`` into ``out_dir`` and return the folder.
 
     Pictures are 8-bit sRGB PNG with straight alpha. ``transforms_*.json`` are written last, so that a folder that has
@@ -86,7 +105,7 @@ def write_dataset(scene, out_dir, options: Options | None = None) -> Path:
             future.result()
     for split, cameras in splits.items():
         _write_json(out_dir / f"transforms_{split}.json", _transforms(scene, split, cameras))
-    if hasattr(scene, "write_truth"):
+    if isinstance(scene, Scene):
         scene.write_truth(out_dir)
     _write_json(out_dir / "provenance.json", _provenance(scene, options, time.perf_counter() - started))
     return out_dir
@@ -107,20 +126,20 @@ def exr_channels(picture: Picture) -> dict[str, np.ndarray]:
     return channels
 
 
-def _transforms(scene, split: str, cameras: list[Camera]) -> dict:
+def _transforms(scene: Renderable, split: str, cameras: list[Camera]) -> dict:
     frames = [
         {"file_path": f"./{split}/r_{k}", "transform_matrix": camera.c2w.tolist()} for k, camera in enumerate(cameras)
     ]
     return {"camera_angle_x": cameras[0].angle_x, "aabb": scene.aabb.tolist(), "frames": frames}
 
 
-def _provenance(scene, options: Options, seconds: float) -> dict:
+def _provenance(scene: Renderable, options: Options, seconds: float) -> dict:
     import numba
 
     integrator = options.integrator
     return {
         "scene": scene.name,
-        "parameters": {k: v for k, v in getattr(scene, "parameters", {}).items()},
+        "parameters": dict(scene.parameters),
         "integrator": repr(integrator) if integrator is not None else scene.integrators[0],
         "views": options.views,
         "size": list(options.size),

@@ -24,10 +24,10 @@ from data_synth import phase as phases
 from data_synth.cameras import pixel_ray
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
-from data_synth.media import BRICK, GRID, Medium, box_interval, lookup
-from data_synth.scene import World, blocked, has_surfaces
+from data_synth.media import BRICK, GRID, Medium, box_interval, lookup, triple
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, mul, sub, unit
+from data_synth.world import World, blocked, has_surfaces
 
 OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
 SIDE = BRICK + 1
@@ -50,7 +50,7 @@ def possible(w: World) -> bool:
     return m.kind == GRID and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not w.bounded
 
 
-def outside(m: Medium, eye) -> bool:
+def outside(m: Medium, eye: np.ndarray) -> bool:
     """Whether an eye is far enough from the medium."""
     near = NEAR * np.array(m.cell)
     return bool(np.any(eye < np.array(m.lo) - near) or np.any(eye > np.array(m.hi) + near))
@@ -76,13 +76,13 @@ def gather(w: World) -> Gathered:
     return Gathered(corner, T)
 
 
-def towards(w: World, gathered: Gathered, eye) -> np.ndarray:
+def towards(w: World, gathered: Gathered, eye: np.ndarray) -> np.ndarray:
     """(4 samples,) float32: rho and the three colours of J towards the eye, sample by sample."""
     rho_J = np.empty(4 * len(gathered.corner) * SAMPLES, np.float32)
-    eye = tuple(float(x) for x in eye)
+    position = triple(eye)
 
     def bricks(first: int, last: int) -> None:
-        _sum_beams(w, gathered, eye, np.empty((7, SAMPLES), np.float32), rho_J, first, last)
+        _sum_beams(w, gathered, position, np.empty((7, SAMPLES), np.float32), rho_J, first, last)
 
     in_bands(bricks, len(gathered.corner), 32)
     return rho_J

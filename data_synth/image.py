@@ -13,8 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image as PillowImage
 
 from data_synth.errors import InputError
@@ -35,7 +37,7 @@ class Picture:
     variance: np.ndarray | None = None
     samples: int = 1
 
-    def over(self, background) -> np.ndarray:
+    def over(self, background: ArrayLike) -> np.ndarray:
         """(H, W, 3) linear colour over a constant linear background."""
         return self.rgb + (1.0 - self.alpha[..., None]) * np.asarray(background, dtype=np.float64)
 
@@ -79,7 +81,8 @@ def write_png(path: str | os.PathLike, pixels: np.ndarray) -> None:
     if pixels.dtype != np.uint8:
         raise InputError(f"write_png: pixels must be uint8, got {pixels.dtype}")
     with replacing(path) as temporary:
-        PillowImage.fromarray(pixels).save(temporary, **({"quality": 88} if Path(path).suffix != ".png" else {}))
+        options: dict[str, Any] = {} if Path(path).suffix == ".png" else {"quality": 88}
+        PillowImage.fromarray(pixels).save(temporary, **options)
 
 
 def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray]) -> None:

@@ -11,8 +11,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -23,10 +24,19 @@ from data_synth.gather import Gathered
 from data_synth.image import Picture
 from data_synth.jit import in_bands
 from data_synth.rng import new_rng
-from data_synth.scene import Scene, World, has_surfaces
 from data_synth.shadowmap import ShadowMaps
+from data_synth.world import World, has_surfaces
+
+if TYPE_CHECKING:
+    from data_synth.scene import Scene
 
 MAP_RESOLUTION = 96  # samples along the longest side of a deep shadow map, unless told otherwise
+
+
+class Integrator(Protocol):
+    """What the table's classes have in common."""
+
+    def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture: ...
 
 
 @dataclass(frozen=True)
@@ -124,33 +134,37 @@ class Path:
         return Picture(out[..., :3], out[..., 3], out[..., 4], out[..., 5:8], self.spp)
 
 
-INTEGRATORS = {"emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview}
+INTEGRATORS: dict[str, Callable[..., Integrator]] = {
+    "emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview,
+}  # fmt: skip
 
 
-def make(name: str, **options):
+def make(name: str, **options: object) -> Integrator:
     """The integrator called ``name``; options None are left at their defaults."""
     if name not in INTEGRATORS:
         raise InputError(f"--integrator: expected one of {', '.join(INTEGRATORS)}, got '{name}'")
     return INTEGRATORS[name](**{key: value for key, value in options.items() if value is not None})
 
 
-class _Prepared(NamedTuple):
+class Prepared(NamedTuple):
+    """What an integrator makes of a scene, whatever the camera."""
+
     world: World
     backdrop: np.ndarray
     maps: ShadowMaps
     gathered: Gathered | None
 
 
-def _prepared(integrator, scene: Scene) -> _Prepared:
+def _prepared(integrator: March | Path, scene: Scene) -> Prepared:
     """Arrays and shadow maps of a scene for an integrator, kept on the scene: they do not depend on the camera."""
-    store = scene.__dict__.setdefault("_prepared", {})
+    store = scene.prepared
     if integrator not in store:
         while len(store) > 1:
             store.pop(next(iter(store)))
         if isinstance(integrator, Path):
-            store[integrator] = _Prepared(scene.world(), np.zeros((0, 16)), shadowmap.none(), None)
+            store[integrator] = Prepared(scene.world(), np.zeros((0, 16)), shadowmap.none(), None)
         else:
             world = scene.world(integrator.beams)
             backdrop = np.array(scene.lights, float).reshape(-1, 16)
-            store[integrator] = _Prepared(world, backdrop, *integrator._light(scene, world))
+            store[integrator] = Prepared(world, backdrop, *integrator._light(scene, world))
     return store[integrator]

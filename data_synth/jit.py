@@ -41,7 +41,7 @@ def kernel(function: Callable) -> Callable:
     """
     compiled = numba.njit(cache=True, **OPTIONS)(function)
     index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
+    if index is not None and hasattr(index, "_source_stamp"):
         index._source_stamp = _STAMP
     return compiled
 

@@ -10,8 +10,10 @@ Columns: kind, 0, 0, 0 | r, g, b | position or direction towards the light (3) |
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
 from data_synth.jit import jit
@@ -23,7 +25,7 @@ POINT, DIRECTIONAL, QUAD, SKY = range(4)
 WIDTH = 16
 
 
-def _row(kind: int, *columns) -> np.ndarray:
+def _row(kind: int, *columns: ArrayLike) -> np.ndarray:
     row = np.zeros(WIDTH)
     row[0] = kind
     values = np.concatenate([np.ravel(c) for c in columns])
@@ -33,28 +35,28 @@ def _row(kind: int, *columns) -> np.ndarray:
     return row
 
 
-def point(position, intensity) -> np.ndarray:
+def point(position: ArrayLike, intensity: ArrayLike) -> np.ndarray:
     """A point that radiates ``intensity`` (RGB, W/sr) equally in all directions."""
     return _row(POINT, rgb(intensity, "intensity"), position)
 
 
-def directional(towards, irradiance) -> np.ndarray:
+def directional(towards: ArrayLike, irradiance: ArrayLike) -> np.ndarray:
     """A distant light seen in direction ``towards``; irradiance is RGB across the beam."""
-    towards = np.asarray(towards, float)
-    return _row(DIRECTIONAL, rgb(irradiance, "irradiance"), towards / np.linalg.norm(towards))
+    direction = np.asarray(towards, float)
+    return _row(DIRECTIONAL, rgb(irradiance, "irradiance"), direction / np.linalg.norm(direction))
 
 
-def quad(corner, edge_u, edge_v, radiance) -> np.ndarray:
+def quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, radiance: ArrayLike) -> np.ndarray:
     """The parallelogram corner + [0,1] edge_u + [0,1] edge_v; it radiates on the side of edge_u x edge_v."""
     return _row(QUAD, rgb(radiance, "radiance"), corner, edge_u, edge_v)
 
 
-def environment(radiance) -> np.ndarray:
+def environment(radiance: ArrayLike) -> np.ndarray:
     """The same radiance from every direction."""
     return sky(radiance, radiance, radiance)
 
 
-def sky(zenith, horizon, ground) -> np.ndarray:
+def sky(zenith: ArrayLike, horizon: ArrayLike, ground: ArrayLike) -> np.ndarray:
     """A smooth sky: radiance at the zenith, at the horizon and below it."""
     return _row(SKY, rgb(zenith, "zenith"), rgb(horizon, "horizon"), rgb(ground, "ground"))
 
@@ -104,7 +106,7 @@ def sky_blend(zenith, horizon, ground, dz):
     return (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
 
 
-def sky_radiance(row: np.ndarray, d) -> tuple:
+def sky_radiance(row: np.ndarray, d: Sequence[float]) -> tuple[float, float, float]:
     """Radiance of a sky light's row from direction d."""
     return sky_blend.py_func(tuple(row[4:7]), tuple(row[7:10]), tuple(row[10:13]), d[2])
 

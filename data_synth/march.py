@@ -21,11 +21,11 @@ from data_synth.lights import escaped, sample_light
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE
 from data_synth.media import attribute, box_interval, extinction, lookup
 from data_synth.rng import reseed
-from data_synth.scene import blocked, inside_medium, next_surface, visible
 from data_synth.shadowmap import ShadowMaps, look_up
 from data_synth.spongecake import attenuation
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, dot, largest, mul, neg, scale, sub
+from data_synth.world import blocked, inside_medium, next_surface, visible
 
 MARCHED, MAPPED, PREVIEW, UNLIT, GATHERED = range(5)
 

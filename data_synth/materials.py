@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import spongecake
 from data_synth.errors import InputError
@@ -27,12 +28,14 @@ class Materials(NamedTuple):
     layers: np.ndarray
 
 
-def lambert(albedo, second=None, square: float = 0.0) -> np.ndarray:
+def lambert(albedo: ArrayLike, second: ArrayLike | None = None, square: float = 0.0) -> np.ndarray:
     """Matt; with ``second`` a checker of squares of edge ``square`` (u) in x, y and z."""
     return _row(LAMBERT, albedo, second, square)
 
 
-def blinn_phong(albedo, gloss: float, exponent: float, second=None, square: float = 0.0) -> np.ndarray:
+def blinn_phong(
+    albedo: ArrayLike, gloss: float, exponent: float, second: ArrayLike | None = None, square: float = 0.0
+) -> np.ndarray:
     """Matt plus an energy-normalised highlight gloss (e + 8)/(8 pi) (n.h)^e; gloss + albedo should stay below 1."""
     row = _row(BLINN_PHONG, albedo, second, square)
     if not 0 <= gloss <= 1 or not exponent >= 0:
@@ -62,7 +65,7 @@ def layered(first: int, last: int) -> np.ndarray:
     return row
 
 
-def _row(kind: int, albedo, second, square: float) -> np.ndarray:
+def _row(kind: int, albedo: ArrayLike, second: ArrayLike | None, square: float) -> np.ndarray:
     row = np.zeros(16)
     row[0], row[1:4], row[7] = kind, rgb(albedo, "albedo", 1.0), square
     row[4:7] = row[1:4] if second is None else rgb(second, "second albedo", 1.0)

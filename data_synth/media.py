@@ -13,16 +13,18 @@ knows the largest and smallest of its samples: exact bounds of the trilinear den
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import phase as phases
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.sggx import projected_area
 
+Point = Sequence[float] | np.ndarray
 BRICK = 8
 HOMOGENEOUS, GRID, EXPONENTIAL = range(3)
 
@@ -58,27 +60,39 @@ class Medium(NamedTuple):
     phase: phases.Phase
 
 
-def rgb(value, name: str, upper: float = math.inf) -> tuple[float, float, float]:
+def triple(values: Iterable[float]) -> tuple[float, float, float]:
+    """Three numbers as kernels take them."""
+    a, b, c = map(float, values)
+    return a, b, c
+
+
+def rgb(value: ArrayLike, name: str, upper: float = math.inf) -> tuple[float, float, float]:
     """A grey number or three numbers as an RGB tuple, finite and in [0, upper]."""
     a = np.broadcast_to(np.asarray(value, dtype=np.float64), (3,)) if np.ndim(value) < 2 else None
     if a is None or not np.isfinite(a).all() or a.min() < 0 or a.max() > upper:
         limit = "finite and not negative" if upper == math.inf else f"in [0, {upper:g}]"
         raise InputError(f"{name}: expected one or three numbers {limit}, got {value}")
-    return tuple(float(v) for v in a)
+    return triple(a)
 
 
-def _table(value, name: str, upper: float = math.inf) -> np.ndarray:
-    rows = value if np.ndim(value) == 2 else [value]
+def _table(value: ArrayLike, name: str, upper: float = math.inf) -> np.ndarray:
+    rows = np.asarray(value) if np.ndim(value) == 2 else [value]
     return np.array([rgb(row, name, upper) for row in rows])
 
 
-def homogeneous(lo, hi, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None) -> Medium:
+def homogeneous(
+    lo: Point, hi: Point, sigma_t: ArrayLike = 1.0, albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0,
+    phase: phases.Phase | None = None,
+) -> Medium:  # fmt: skip
     """Density 1 inside the box lo..hi. sigma_t in 1/u."""
     one = np.ones(1)
     return _medium(HOMOGENEOUS, lo, hi, (1, 1, 1), (one, one), sigma_t, albedo, Le, phase)
 
 
-def exponential(lo, hi, height: float, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None) -> Medium:
+def exponential(
+    lo: Point, hi: Point, height: float, sigma_t: ArrayLike = 1.0, albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0,
+    phase: phases.Phase | None = None,
+) -> Medium:  # fmt: skip
     """Density exp(-(z - lo_z) / height): fog and atmospheres, with a closed-form optical thickness. height in u."""
     if not (math.isfinite(height) and height > 0):
         raise InputError(f"exponential: height must be positive, got {height}")
@@ -88,7 +102,10 @@ def exponential(lo, hi, height: float, sigma_t=1.0, albedo=0.0, Le=0.0, phase=No
     return medium._replace(base=float(lo[2]), falloff=1.0 / height)
 
 
-def grid(density, lo, hi, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None, attribute=None, majorant=None) -> Medium:
+def grid(
+    density: ArrayLike, lo: Point, hi: Point, sigma_t: ArrayLike = 1.0, albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0,
+    phase: phases.Phase | None = None, attribute: ArrayLike | None = None, majorant: float | None = None,
+) -> Medium:  # fmt: skip
     """A heterogeneous medium of (nx, ny, nz) density samples at the vertices of a regular grid from lo to hi.
 
     attribute: same shape, in [0, 1]. majorant: an upper bound the caller believes in; lower is an error.
@@ -108,7 +125,7 @@ def grid(density, lo, hi, sigma_t=1.0, albedo=0.0, Le=0.0, phase=None, attribute
     return medium._replace(offsets=stored[2], samples=stored[3], attributes=stored[4])
 
 
-def from_function(function: Callable, lo, hi, resolution: int = 128, **coefficients) -> Medium:
+def from_function(function: Callable, lo: Point, hi: Point, resolution: int = 128, **coefficients: Any) -> Medium:
     """A grid sampled from ``function(x, y, z)`` of broadcast arrays, ``resolution`` samples along the longest side."""
     lo, hi = np.asarray(lo, float), np.asarray(hi, float)
     spacing = (hi - lo).max() / (resolution - 1)
@@ -118,7 +135,7 @@ def from_function(function: Callable, lo, hi, resolution: int = 128, **coefficie
     return grid(density, lo, hi, **coefficients)
 
 
-def _bricks(density: np.ndarray, attribute) -> tuple:
+def _bricks(density: np.ndarray, attribute: ArrayLike | None) -> tuple[np.ndarray, ...]:
     cells = np.array(density.shape) - 1
     counts = -(-cells // BRICK)
     padding = [(0, int(n * BRICK - c)) for n, c in zip(counts, cells, strict=True)]
@@ -139,16 +156,20 @@ def _bricks(density: np.ndarray, attribute) -> tuple:
     return top.astype(float), bottom.astype(float), offsets, samples, attributes
 
 
-def _medium(kind, lo, hi, cells, bounds, sigma_t, albedo, Le, phase) -> Medium:
-    lo, hi = tuple(map(float, lo)), tuple(map(float, hi))
+def _medium(
+    kind: int, lo: Point, hi: Point, cells: tuple[int, int, int], bounds: Sequence[np.ndarray],
+    sigma_t: ArrayLike, albedo: ArrayLike, Le: ArrayLike, phase: phases.Phase | None,
+) -> Medium:  # fmt: skip
+    lo, hi = triple(lo), triple(hi)
     if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"medium: expected a box with lo < hi, got {lo} and {hi}")
     phase = phase or phases.isotropic()
     area = math.sqrt(max(np.linalg.eigvalsh(_matrix(s))[-1] for s in phase.S))
-    cell = tuple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
+    cell = triple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
+    nx, ny, nz = (-(-n // BRICK) for n in cells) if kind == GRID else cells
     step = min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
     return Medium(
-        kind, lo, hi, cells, tuple(-(-n // BRICK) for n in cells) if kind == GRID else cells, cell,
+        kind, lo, hi, cells, (nx, ny, nz), cell,
         np.zeros(1, np.int64), np.zeros(1, np.float32), np.zeros(1, np.float32),
         np.ascontiguousarray(bounds[0], dtype=float), np.ascontiguousarray(bounds[1], dtype=float),
         float(np.max(bounds[0], initial=0.0)), rgb(sigma_t, "sigma_t"), _table(albedo, "albedo", 1.0),
@@ -156,7 +177,7 @@ def _medium(kind, lo, hi, cells, bounds, sigma_t, albedo, Le, phase) -> Medium:
     )  # fmt: skip
 
 
-def _matrix(s) -> np.ndarray:
+def _matrix(s: Sequence[float]) -> np.ndarray:
     return np.array([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
 
 

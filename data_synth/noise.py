@@ -50,9 +50,7 @@ def perlin(x, y, z, cells, seed):
     for corner in range(8):
         a, b, c = corner & 1, corner >> 1 & 1, corner >> 2
         weight = fade(u if a else 1.0 - u) * fade(v if b else 1.0 - v) * fade(w if c else 1.0 - w)
-        total += weight * corner_gradient(
-            (i + a) % cells, (j + b) % cells, (k + c) % cells, u - a, v - b, w - c, seed
-        )
+        total += weight * corner_gradient((i + a) % cells, (j + b) % cells, (k + c) % cells, u - a, v - b, w - c, seed)
     return total
 
 

@@ -17,9 +17,9 @@ from data_synth.lights import column3, escaped, quad_pdf, sample_light
 from data_synth.materials import DIELECTRIC, NULL
 from data_synth.media import attribute, box_interval, extinction, lookup
 from data_synth.rng import reseed, uniform
-from data_synth.scene import inside_medium, next_surface, visible
 from data_synth.traverse import collisions, traversal
 from data_synth.vec import add, along, dot, largest, mul, neg, scale, sub
+from data_synth.world import inside_medium, next_surface, visible
 
 ROULETTE_DEPTH = 6
 SEGMENTS = 100_000  # only a guard: roulette and max_depth end paths long before

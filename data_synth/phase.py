@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import sggx
 from data_synth.errors import InputError
@@ -62,11 +63,10 @@ def two_lobes(g1: float, g2: float, mix: float) -> Phase:
     return Phase(HG, float(g1), float(g2), float(mix), _NO_FLAKES)
 
 
-def microflakes(*S, diffuse: bool = False) -> Phase:
+def microflakes(*S: ArrayLike, diffuse: bool = False) -> Phase:
     """SGGX microflakes, specular by default. S: one or more 3x3 matrices or rows of six numbers (``sggx.fibre``)."""
     rows = []
-    for s in S:
-        s = np.asarray(s, dtype=np.float64)
+    for s in (np.asarray(s, dtype=np.float64) for s in S):
         rows.append(sggx.check_sggx(s if s.shape == (3, 3) else s[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)))
     return Phase(SGGX_DIFFUSE if diffuse else SGGX_SPECULAR, 0.0, 0.0, 1.0, np.stack(rows))
 

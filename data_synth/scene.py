@@ -1,43 +1,23 @@
-"""A scene: one medium, surfaces, materials and lights, and how kernels walk through it."""
+"""A scene: one medium, surfaces, materials and lights."""
 
 from __future__ import annotations
 
-import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import lights as lamps
 from data_synth import materials as stuff
-from data_synth import media, surfaces
+from data_synth import media, surfaces, volumes
 from data_synth.cameras import Camera, Viewpoints
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
-from data_synth.jit import jit
-from data_synth.lights import hit_quad
-from data_synth.materials import DIELECTRIC, NULL
-from data_synth.surfaces import intersect
-from data_synth.transmittance import shadow_transmittance
-from data_synth.vec import along, dot, mul
-
-
-class World(NamedTuple):
-    """The scene as kernels see it. bounded: the medium fills closed boundary surfaces, not its whole box."""
-
-    medium: media.Medium
-    geometry: surfaces.Geometry
-    materials: stuff.Materials
-    lights: np.ndarray
-    bounded: bool
-
-
-def has_surfaces(w: World) -> bool:
-    """Whether anything but the medium and the sky can be seen."""
-    return len(w.geometry.shapes) + len(w.geometry.triangles) > 0
-
+from data_synth.integrators import Integrator, Prepared, make
+from data_synth.world import World
 
 NOTHING = media.homogeneous((-1e-3,) * 3, (1e-3,) * 3, sigma_t=0.0)
 
@@ -67,6 +47,8 @@ class Scene:
     integrators: tuple[str, ...] = ("deep", "march", "path")
     exposure: float = 1.0
     parameters: dict = field(default_factory=dict)
+    prepared: dict[object, Prepared] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """What integrators keep for the next view: arrays and shadow maps, which do not depend on the camera."""
 
     def world(self, beams: int = 0) -> World:
         """The arrays for kernels. beams > 0 replaces sky and quad lights by that many beams each."""
@@ -85,81 +67,15 @@ class Scene:
             self.bounded,
         )
 
-    def render(self, camera: Camera, integrator=None, seed: int = 0) -> Picture:
+    def render(self, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
         """One view, by default with the scene's own choice of integrator."""
-        from data_synth.integrators import make
-
         return (integrator or make(self.integrators[0])).render(self, camera, seed=seed)
 
     def write_truth(self, out_dir: Path) -> None:
         """density.npz and density.vdb: the true extinction of a grid medium."""
-        from data_synth.volumes import write_density
-
         if self.medium is not None and self.medium.kind == media.GRID:
-            write_density(self.medium, out_dir)
+            volumes.write_density(self.medium, out_dir)
 
 
-def _table(rows, width: int) -> np.ndarray:
+def _table(rows: Sequence[ArrayLike], width: int) -> np.ndarray:
     return np.array(rows, dtype=float).reshape(-1, width)
-
-
-@jit
-def inside_medium(w, ray):
-    """Whether a ray starts inside a closed boundary: the first boundary it meets is one it leaves."""
-    if not w.bounded:
-        return True
-    t = 0.0
-    for _ in range(64):
-        start = (along(ray, t), ray[1])
-        step, n, material = intersect(w.geometry, start, math.inf)
-        if material < 0:
-            return False
-        if w.materials.rows[material, 0] >= DIELECTRIC:
-            return dot(ray[1], n) > 0.0
-        t += step
-    return False
-
-
-@jit
-def visible(w, ray, t_max, inside, random, rng):
-    """RGB transmittance from the ray's origin over t_max: 0 behind surfaces, attenuated by the medium.
-
-    random: by ratio tracking, unbiased; else by marching. Media with a closed form use it in both cases.
-    """
-    total = (1.0, 1.0, 1.0)
-    for _ in range(64):
-        t, n, material = intersect(w.geometry, ray, t_max)
-        if material >= 0 and w.materials.rows[material, 0] != NULL:
-            return (0.0, 0.0, 0.0)
-        if inside:
-            total = mul(total, shadow_transmittance(w.medium, ray, t, random, rng))
-        if material < 0:
-            return total
-        ray = (along(ray, t), ray[1])
-        t_max -= t
-        inside = dot(ray[1], n) < 0.0 if w.bounded else inside
-    return total
-
-
-@jit
-def blocked(w, ray, t_max):
-    """Whether a surface other than null boundaries stands within t_max."""
-    for _ in range(64):
-        t, n, material = intersect(w.geometry, ray, t_max)
-        if material < 0:
-            return False
-        if w.materials.rows[material, 0] != NULL:
-            return True
-        ray = (along(ray, t), ray[1])
-        t_max -= t
-    return False
-
-
-@jit
-def next_surface(w, ray):
-    """(t, n, material, quad): the nearest surface; or quad >= 0, a quad light that stands before it."""
-    t, n, material = intersect(w.geometry, ray, math.inf)
-    t, quad = hit_quad(w.lights, ray, t)
-    if quad >= 0:
-        material = -1
-    return t, n, material, quad

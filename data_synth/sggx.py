@@ -12,6 +12,7 @@ All directions point outward, away from the point.
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
 from data_synth.jit import jit
@@ -19,17 +20,17 @@ from data_synth.rng import uniform
 from data_synth.vec import add, dot, frame, scale, sphere_direction, sub, unit
 
 
-def fibre(axis, roughness: float) -> np.ndarray:
+def fibre(axis: ArrayLike, roughness: float) -> np.ndarray:
     """S of fibres along ``axis``: R diag(1, 1, roughness^2) R' as six numbers."""
     return _about(axis, 1.0, roughness * roughness, roughness)
 
 
-def surface(normal, roughness: float) -> np.ndarray:
+def surface(normal: ArrayLike, roughness: float) -> np.ndarray:
     """S of flakes that face ``normal``: R diag(roughness^2, roughness^2, 1) R' as six numbers."""
     return _about(normal, roughness * roughness, 1.0, roughness)
 
 
-def _about(axis, across: float, along: float, roughness: float) -> np.ndarray:
+def _about(axis: ArrayLike, across: float, along: float, roughness: float) -> np.ndarray:
     if not 0.0 < roughness <= 1.0:
         raise InputError(f"SGGX: roughness must be in (0, 1], got {roughness}")
     a = np.asarray(axis, dtype=np.float64)
@@ -37,7 +38,7 @@ def _about(axis, across: float, along: float, roughness: float) -> np.ndarray:
     return check_sggx(across * np.eye(3) + (along - across) * np.outer(a, a))
 
 
-def check_sggx(matrix) -> np.ndarray:
+def check_sggx(matrix: ArrayLike) -> np.ndarray:
     """The six numbers of a symmetric positive definite 3x3 matrix; anything else is an error."""
     s = np.asarray(matrix, dtype=np.float64)
     if s.shape != (3, 3) or not np.isfinite(s).all() or np.abs(s - s.T).max() > 1e-9:
@@ -64,9 +65,7 @@ def projected_area(s, w):
 
 @jit
 def determinant(s):
-    return (
-        s[0] * s[1] * s[2] + 2.0 * s[3] * s[4] * s[5] - s[0] * s[5] * s[5] - s[1] * s[4] * s[4] - s[2] * s[3] * s[3]
-    )
+    return s[0] * s[1] * s[2] + 2.0 * s[3] * s[4] * s[5] - s[0] * s[5] * s[5] - s[1] * s[4] * s[4] - s[2] * s[3] * s[3]
 
 
 @jit

@@ -20,8 +20,8 @@ from data_synth.errors import InputError
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.lights import DIRECTIONAL, sample_light
 from data_synth.rng import new_rng
-from data_synth.scene import World, inside_medium, visible
 from data_synth.vec import frame
+from data_synth.world import World, inside_medium, visible
 
 
 class ShadowMaps(NamedTuple):

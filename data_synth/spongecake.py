@@ -14,8 +14,10 @@ A layer table is (n, 10) float: tau, S (6), F (3); rows from the top (+z) down.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import sggx
 from data_synth.errors import InputError
@@ -25,7 +27,7 @@ from data_synth.rng import uniform
 from data_synth.vec import add, dot, scale
 
 
-def layer(tau: float, S, albedo) -> np.ndarray:
+def layer(tau: float, S: Sequence[float] | np.ndarray, albedo: ArrayLike) -> np.ndarray:
     """One layer: tau >= 0, S from ``sggx.fibre`` or ``sggx.surface``, albedo grey or RGB in [0, 1]."""
     if not (math.isfinite(tau) and tau >= 0):
         raise InputError(f"SpongeCake layer: tau must be finite and not negative, got {tau}")

@@ -8,9 +8,11 @@ shapes, on the side of edge x edge for triangles.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
 from data_synth.jit import jit
@@ -30,35 +32,35 @@ class Geometry(NamedTuple):
     bvh: np.ndarray
 
 
-def plane(material: int, point, normal) -> np.ndarray:
+def plane(material: int, point: ArrayLike, normal: ArrayLike) -> np.ndarray:
     """An infinite plane."""
-    normal = np.asarray(normal, float)
-    return _shape(PLANE, material, point, normal / np.linalg.norm(normal))
+    n = np.asarray(normal, float)
+    return _shape(PLANE, material, point, n / np.linalg.norm(n))
 
 
-def sphere(material: int, centre, radius: float) -> np.ndarray:
+def sphere(material: int, centre: ArrayLike, radius: float) -> np.ndarray:
     if not radius > 0:
         raise InputError(f"sphere: radius must be positive, got {radius}")
     return _shape(SPHERE, material, centre, [radius])
 
 
-def box(material: int, lo, hi) -> np.ndarray:
+def box(material: int, lo: ArrayLike, hi: ArrayLike) -> np.ndarray:
     """An axis-aligned box."""
     return _shape(BOX, material, lo, hi)
 
 
-def mesh(material: int, vertices, faces) -> np.ndarray:
+def mesh(material: int, vertices: ArrayLike, faces: ArrayLike) -> np.ndarray:
     """(m, 12) rows of triangles from (n, 3) vertices and (m, 3) vertex numbers."""
-    vertices, faces = np.asarray(vertices, float), np.asarray(faces)
-    if not np.isfinite(vertices).all() or faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+    points, corners = np.asarray(vertices, float), np.asarray(faces)
+    if not np.isfinite(points).all() or corners.size and (corners.min() < 0 or corners.max() >= len(points)):
         raise InputError("mesh: expected finite vertices and faces that number them")
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    rows = np.zeros((len(faces), 12))
+    a, b, c = (points[corners[:, k]] for k in range(3))
+    rows = np.zeros((len(corners), 12))
     rows[:, 0], rows[:, 1:4], rows[:, 4:7], rows[:, 7:10] = material, a, b - a, c - a
     return rows
 
 
-def _shape(kind: int, material: int, *columns) -> np.ndarray:
+def _shape(kind: int, material: int, *columns: ArrayLike) -> np.ndarray:
     row = np.zeros(12)
     values = np.concatenate([np.ravel(np.asarray(c, float)) for c in columns])
     if not np.isfinite(values).all():
@@ -67,7 +69,7 @@ def _shape(kind: int, material: int, *columns) -> np.ndarray:
     return row
 
 
-def geometry(shapes=(), triangles=None) -> Geometry:
+def geometry(shapes: Sequence[np.ndarray] = (), triangles: np.ndarray | None = None) -> Geometry:
     """Collect shapes, and triangles in a hierarchy (median split along the longest side)."""
     table = np.array(shapes, float).reshape(-1, 12)
     if triangles is None or len(triangles) == 0:
@@ -76,7 +78,8 @@ def geometry(shapes=(), triangles=None) -> Geometry:
         [np.zeros_like(triangles[:, 1:4]), triangles[:, 4:7], triangles[:, 7:10]], axis=1
     )
     lo, hi = corners.min(axis=1), corners.max(axis=1)
-    order, nodes = np.arange(len(triangles)), []
+    order = np.arange(len(triangles))
+    nodes: list[list[float]] = []
 
     def build(first: int, last: int) -> None:
         part = order[first:last]

@@ -10,6 +10,7 @@ of the plane before is interpolated by cubics, since linear interpolation would 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ class Shift(NamedTuple):
     weights: np.ndarray
 
 
-def thickness(rho: np.ndarray, cell, towards) -> np.ndarray:
+def thickness(rho: np.ndarray, cell: Sequence[float], towards: Sequence[float]) -> np.ndarray:
     """(nx, ny, nz) float32 integrals of rho (same shape) from every sample along unit ``towards``. cell: edges in u.
 
     The same bits for any number of threads: each integral is made by one of them, and the sum has one order.

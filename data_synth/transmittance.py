@@ -20,7 +20,7 @@ import numpy as np
 
 from data_synth.errors import InputError
 from data_synth.jit import jit, kernel
-from data_synth.media import EXPONENTIAL, GRID, HOMOGENEOUS, Medium, box_interval, extinction
+from data_synth.media import EXPONENTIAL, GRID, HOMOGENEOUS, Medium, Point, box_interval, extinction, triple
 from data_synth.rng import new_rng, uniform
 from data_synth.traverse import cells, chord_thickness, collisions, steps, traversal
 from data_synth.vec import along, exp_neg, largest, scale
@@ -202,7 +202,16 @@ def _flights(m, ray, t1, method, local, rng, out):
         out[k] = free_flight(m, ray, 0.0, t1, method, local, rng)
 
 
-def sample_transmittance(m: Medium, o, d, t1=np.inf, method="ratio", local=True, n=1, seed=0) -> np.ndarray:
+def sample_transmittance(
+    m: Medium,
+    o: Point,
+    d: Point,
+    t1: float = np.inf,
+    method: str = "ratio",
+    local: bool = True,
+    n: int = 1,
+    seed: int = 0,
+) -> np.ndarray:
     """(n, 3) independent estimates of the RGB transmittance from o over a distance t1 along unit d.
 
     method: a row of the table above. local: one majorant per brick instead of one for all.
@@ -212,18 +221,26 @@ def sample_transmittance(m: Medium, o, d, t1=np.inf, method="ratio", local=True,
     return out
 
 
-def sample_flights(m: Medium, o, d, t1=np.inf, method="woodcock", local=True, n=1, seed=0) -> np.ndarray:
+def sample_flights(
+    m: Medium,
+    o: Point,
+    d: Point,
+    t1: float = np.inf,
+    method: str = "woodcock",
+    local: bool = True,
+    n: int = 1,
+    seed: int = 0,
+) -> np.ndarray:
     """(n,) independent free-flight distances from o along unit d, inf for those that leave or reach t1."""
     out = np.empty(n)
     _flights(m, _ray(o, d), float(t1), _method(m, method, DISTANCE_METHODS), bool(local), new_rng(seed, 0), out)
     return out
 
 
-def _ray(o, d) -> tuple:
-    o, d = tuple(float(v) for v in o), tuple(float(v) for v in d)
+def _ray(o: Point, d: Point) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     if abs(math.hypot(*d) - 1.0) > 1e-9:
         raise InputError(f"ray: direction must have unit length, got length {math.hypot(*d):.6g}")
-    return o, d
+    return triple(o), triple(d)
 
 
 def _method(m: Medium, name: str, methods: dict) -> int:

@@ -12,6 +12,7 @@ Composing functions at import, as in ``traversal(cells(event))``, lets the compi
 """
 
 import math
+from collections.abc import Callable
 
 from data_synth.jit import jit
 from data_synth.media import EXPONENTIAL, GRID, extinction
@@ -19,7 +20,7 @@ from data_synth.rng import uniform
 from data_synth.vec import along, largest
 
 
-def traversal(stepper):
+def traversal(stepper: Callable) -> Callable:
     """A function that folds over [t0, t1]; with local = False the box is one brick with the global bounds."""
 
     @jit
@@ -74,7 +75,7 @@ def first_crossing(o, d, i, size):
     return math.inf, 0
 
 
-def steps(event):
+def steps(event: Callable) -> Callable:
     """Midpoints of the fewest equal steps that are not longer than m.step."""
 
     @jit
@@ -90,7 +91,7 @@ def steps(event):
     return stepper
 
 
-def cells(event):
+def cells(event: Callable) -> Callable:
     """Each cell's chord; the event gets the chord's midpoint. Media without a grid are one cell per brick."""
 
     @jit
@@ -115,7 +116,7 @@ def cells(event):
     return stepper
 
 
-def collisions(event):
+def collisions(event: Callable) -> Callable:
     """Tentative collisions at the rate of the majorant: the largest extinction of the brick in any colour."""
 
     @jit

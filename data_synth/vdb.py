@@ -13,8 +13,10 @@ import uuid
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
 from data_synth.image import replacing
@@ -39,7 +41,7 @@ class VdbGrid:
 
 
 class _Reader:
-    def __init__(self, data: bytes, path) -> None:
+    def __init__(self, data: bytes, path: str | os.PathLike) -> None:
         self.data, self.at, self.path = data, 0, path
 
     def fail(self, what: str) -> InputError:
@@ -51,7 +53,7 @@ class _Reader:
         self.at += n
         return self.data[self.at - n : self.at]
 
-    def number(self, kind: str):
+    def number(self, kind: str) -> Any:
         return struct.unpack("<" + kind, self.take(struct.calcsize("<" + kind)))[0]
 
     def numbers(self, kind: str, n: int) -> np.ndarray:
@@ -211,10 +213,10 @@ class _Tree:
             raise self.r.fail(f"its extent {tuple(int(v) for v in last - first)} is too large to hold")
         out = np.full(tuple(last - first), self.background, np.float32)
 
-        def put(origin, edge: int, value) -> None:
+        def put(origin: np.ndarray, edge: int, value: ArrayLike) -> None:
             a, b = np.maximum(origin - first, 0), np.minimum(origin + edge - first, last - first)
             c, d = a - (origin - first), b - (origin - first)
-            part = value if np.isscalar(value) else value[c[0] : d[0], c[1] : d[1], c[2] : d[2]]
+            part = value if np.ndim(value) == 0 else np.asarray(value)[c[0] : d[0], c[1] : d[1], c[2] : d[2]]
             if (a < b).all():
                 out[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = part
 
@@ -225,7 +227,12 @@ class _Tree:
         return first, out
 
 
-def write_vdb(path: str | os.PathLike, values: np.ndarray, voxel_size=(1.0, 1.0, 1.0), origin=(0.0, 0.0, 0.0)) -> None:
+def write_vdb(
+    path: str | os.PathLike,
+    values: np.ndarray,
+    voxel_size: ArrayLike = (1.0, 1.0, 1.0),
+    origin: ArrayLike = (0.0, 0.0, 0.0),
+) -> None:
     """Write non-negative (nx, ny, nz) values as the float grid "density"; voxels above 0 are active."""
     values = np.asarray(values, np.float32)
     if values.ndim != 3 or max(values.shape) > 4096 or not np.isfinite(values).all():

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import difflib
 import inspect
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from data_synth import lights
 from data_synth.errors import InputError
+from data_synth.scene import Scene
 from data_synth.scenes.showcase import Showcase
 from data_synth.scenes.simple import cloth, fog, leaf, mist, slab, solids, sphere
 from data_synth.scenes.volumes import cloud, cumulonimbus, explosion, phantom, smoke, stratus
 
-SCENES = {"showcase": Showcase} | {
+SCENES: Mapping[str, Callable[..., Showcase | Scene]] = {"showcase": Showcase} | {
     scene.__name__: scene
     for scene in (
         cloud, cumulonimbus, stratus, smoke, explosion, fog, mist, solids, phantom, cloth, leaf, slab, sphere,
@@ -32,10 +35,10 @@ LIGHTS = {
 def summary(name: str) -> str:
     """One line about a scene."""
     factory = SCENES[name]
-    return getattr(factory, "summary", None) or inspect.getdoc(factory).splitlines()[0]
+    return getattr(factory, "summary", None) or (inspect.getdoc(factory) or name).splitlines()[0]
 
 
-def make(name: str, light: str | None = None, **parameters):
+def make(name: str, light: str | None = None, **parameters: Any) -> Showcase | Scene:
     """The scene called ``name``, its defaults overridden by ``parameters``.
 
     light: names of LIGHTS, separated by commas, that replace the scene's own. An unknown name is an error that tells
@@ -58,14 +61,15 @@ def make(name: str, light: str | None = None, **parameters):
     if light is not None:
         names = light.split(",")
         for each in names:
-            if each not in LIGHTS or name == "showcase":
+            if each not in LIGHTS or isinstance(scene, Showcase):
                 what = "the showcase keeps its own" if name == "showcase" else f"one of {', '.join(LIGHTS)}"
                 raise InputError(f"--light: expected {what}, got '{each}'{_hint(each, LIGHTS)}")
-        scene.lights = [LIGHTS[each] for each in names]
+        if isinstance(scene, Scene):
+            scene.lights = [LIGHTS[each] for each in names]
         scene.parameters["light"] = light
     return scene
 
 
-def _hint(word: str, known) -> str:
+def _hint(word: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]}?" if near else ""

@@ -142,9 +142,7 @@ def radiance(haze, ox, oy, oz, dx, dy, dz):
     """The emission-absorption integral along one ray: premultiplied r, g, b, then alpha and sum_i w_i t_i."""
     t_hit, which = sphere_trace(ox, oy, oz, dx, dy, dz)
     reach, half = haze.radius + 3.0 * haze.width, 3.0 * haze.width + 0.10
-    t0, t1 = box_interval(
-        ox, oy, oz, dx, dy, dz, -reach, -reach, haze.height - half, reach, reach, haze.height + half
-    )
+    t0, t1 = box_interval(ox, oy, oz, dx, dy, dz, -reach, -reach, haze.height - half, reach, reach, haze.height + half)
     t1 = min(t1, t_hit)
     r, g, b, far, trans = 0.0, 0.0, 0.0, 0.0, 1.0
     if t1 > t0:
@@ -211,12 +209,13 @@ class Showcase:
     summary = "glossy solids on a checker base inside a ring of glowing haze (emission-absorption truth)"
     viewpoints = Viewpoints(target=(0.0, 0.0, -0.2), radius=4.0, elevation=(8.0, 75.0), fov=40.0)
     aabb = np.array([[-1.35, -1.35, -0.7], [1.35, 1.35, 0.7]])
-    integrators = ("emission",)
+    integrators: tuple[str, ...] = ("emission",)
     exposure = 1.0
 
     def __init__(self, haze: float = 4.5, steps: int = 96, smooth: int = 2) -> None:
         self.haze = Haze(sigma=float(haze), radius=0.62, width=0.13, height=0.28, steps=int(steps))
         self.smooth = int(smooth)
+        self.parameters: dict = {}
 
     def render(self, camera: Camera) -> Picture:
         """One ray per pixel centre; pixels at an edge are the mean of a regular grid of rays."""

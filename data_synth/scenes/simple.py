@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_synth import lights, materials, media, phase, spongecake, surfaces
 from data_synth import sggx as flakes
@@ -82,7 +83,7 @@ def _stage_materials() -> list:
     ]
 
 
-def _gem(material: int, centre, radius: float) -> np.ndarray:
+def _gem(material: int, centre: ArrayLike, radius: float) -> np.ndarray:
     """An octahedron stretched along z."""
     v = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float) * radius
     f = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]]

@@ -14,6 +14,8 @@ from data_synth.scenes.procedural import fill_fireball, fill_plume
 from data_synth.volumes import read_volume
 
 CLOUD_PHASE = phase.two_lobes(0.6, -0.25, 0.6)
+EVENING_SUN = lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5))
+EVENING_SKY = lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5))
 
 
 def cloud(
@@ -23,19 +25,27 @@ def cloud(
     """a cumulus at sunset: warm sun from the side, blue sky above"""
     lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
     shape = (resolution, resolution, int(resolution * 1.7 / 2.6))
-    rho, lo, hi = _imported(volume, clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed), lo, hi)
+    if volume is None:
+        rho = clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed)
+    else:
+        rho, lo, hi = _imported(volume, lo, hi)
     medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
-        lights=[
-            lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5)),
-            lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5)),
-        ],
+        lights=[EVENING_SUN, EVENING_SKY],
         viewpoints=Viewpoints(radius=4.6, elevation=(-5, 60), fov=40),
         integrators=("deep", "march", "path", "preview"),
         aabb=np.array([lo, hi]),
         exposure=0.62,
     )
+
+
+def cumulus(*lit: np.ndarray, resolution: int = 128) -> Scene:
+    """The cloud of the benchmarks: a cube of samples, 22/u, albedo 0.99, Henyey-Greenstein g = 0.7."""
+    lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
+    rho = clouds.cloud("cumulus", (resolution,) * 3, 0.95, 1.0, 0.3, 0)
+    medium = media.grid(rho, lo, hi, 22.0, 0.99, phase=phase.henyey_greenstein(0.7))
+    return Scene("cumulus", medium, lights=list(lit), viewpoints=Viewpoints(radius=4.6), exposure=0.62)
 
 
 def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int = 128, seed: int = 3) -> Scene:
@@ -82,7 +92,7 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
         detail = cloud_textures(seed, 64).base
         in_bands(lambda a, b: fill_plume(detail, rho, a, b), rho.shape[0], 4)
     else:
-        rho, lo, hi = _imported(volume, None, lo, hi, up="y")
+        rho, lo, hi = _imported(volume, lo, hi, up="y")
     medium = media.grid(rho, lo, hi, density, (0.92, 0.90, 0.88), phase=phase.henyey_greenstein(0.3))
     return Scene(
         medium=medium,
@@ -120,7 +130,7 @@ def phantom(density: float = 40.0, resolution: int = 128, volume: str | None = N
         lo, hi = (-0.8, -1.0, -0.8), (0.8, 1.0, 0.8)
         value = _head(resolution)
     else:
-        value, lo, hi = _imported(volume, None, (-1.1,) * 3, (1.1,) * 3)
+        value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3)
     # tissue value -> opacity and colour: (value, extinction, r, g, b)
     points = np.array(
         [
@@ -150,7 +160,7 @@ def _head(n: int) -> np.ndarray:
     """Ellipsoids after Shepp & Logan, as tissue values in [0, 1] with soft edges."""
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij", sparse=True)
 
-    def ball(cx, cy, cz, rx, ry, rz):
+    def ball(cx: float, cy: float, cz: float, rx: float, ry: float, rz: float) -> np.ndarray:
         r = np.sqrt(((x - cx) / rx) ** 2 + ((y - cy) / ry) ** 2 + ((z - cz) / rz) ** 2)
         return np.clip((1.0 - r) * min(rx, ry, rz) * n / 5.0 + 0.5, 0.0, 1.0)
 
@@ -167,10 +177,10 @@ def _head(n: int) -> np.ndarray:
     return np.clip(value * cut, 0, 1)
 
 
-def _imported(volume: str | None, default, lo, hi, up: str = "z") -> tuple:
-    """The volume file's samples scaled to [0, 1] in a box as large as lo..hi allows, or the default."""
-    if volume is None:
-        return default, lo, hi
+def _imported(
+    volume: str, lo: media.Point, hi: media.Point, up: str = "z"
+) -> tuple[np.ndarray, media.Point, media.Point]:
+    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows."""
     values, spacing = read_volume(volume)
     if up == "y":  # right-handed: x, y, z -> x, -z, y
         values, spacing = values[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]

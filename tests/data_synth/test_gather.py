@@ -153,5 +153,5 @@ def test_what_cannot_be_gathered_is_read_from_maps(why, monkeypatch):
 def test_maps_are_not_made_where_nothing_reads_them():
     scene = Scene(medium=cloud(17), lights=[SUN])
     DeepShadow().render(scene, CAMERA)
-    (prepared,) = scene._prepared.values()
+    (prepared,) = scene.prepared.values()
     assert prepared.gathered is not None and isinstance(prepared.maps, ShadowMaps) and prepared.maps.values.size == 0
