@@ -322,11 +322,10 @@ def _sphere(n: int) -> tuple[Tensor, Tensor]:
 def largest_weights(octree: Octree, dataset: Dataset, background: Sequence[float], downscale: int) -> np.ndarray:
     """(n_leaves,) largest rendering weight of each leaf over all rays of the dataset at 1/downscale of its size."""
     bank = TileBank(dataset, background, downscale)
-    state = ops.TrainState(octree)
-    options, still = ops.LossOptions(tuple(background), early_stop_eps=1e-3), ops.Rates(0.0, 0.0, 0.0)
+    statistics, options = ops.LeafStatistics(octree), ops.LossOptions(tuple(background), early_stop_eps=1e-3)
     for tiles in np.array_split(np.arange(bank.n_tiles), max(1, bank.n_tiles // 32)):
-        # A training step with rates of zero: it moves nothing and notes the weights. At this size of the images leaves are
-        # small, and what a tile leaves behind for the second phase of a step is large: few tiles at a time.
+        # At this size of the images leaves are small, and what a tile leaves behind for the second phase is large: few
+        # tiles at a time.
         batch = bank.batch(tiles, np.ones(len(tiles), dtype=np.float32))
-        ops.train_step(octree, state, batch, options, still, bank.pixel_angle)
-    return state.max_weight
+        ops.leaf_statistics(octree, batch, options, bank.pixel_angle, statistics)
+    return statistics.max_weight

@@ -175,11 +175,17 @@ class OctreeTrainer:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
         smooth = fade if self.steps_done >= c.smooth_from else 0.0
-        terms = c.colour * fade, c.distortion * fade, c.smooth_density * smooth, c.smooth_colour * smooth
-        options = ops.LossOptions(self._behind(), *terms, c.early_stop_eps)
+        options = ops.LossOptions(
+            background=self._behind(),
+            colour=c.colour * fade,
+            distortion=c.distortion * fade,
+            tv_density=c.smooth_density * smooth,
+            tv_sh=c.smooth_colour * smooth,
+            early_stop_eps=c.early_stop_eps,
+        )
         late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
         rate = c.rate_decay**late
-        rates = ops.Rates(c.rate_density * rate, c.rate_dc * rate, c.rate_sh * rate, c.beta)
+        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=c.beta)
         batch = self.bank.draw(c.tiles[self.stage], c.rich_share, self.seed, self.rich, self.plain)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
         self.steps_done += 1

@@ -70,9 +70,9 @@ def test_learns_the_ball(dataset: Dataset, sampler: str) -> None:
     assert float(image["opacity"][inside].mean()) > 0.5 and float(image["opacity"][~inside].mean()) < 0.2
     if sampler == "occupancy":
         assert trainer.grid.fraction < 0.7
-        assert metrics[-1]["samples_per_ray"] < 0.5 * max(m["samples_per_ray"] for m in metrics[:20])
+        assert metrics[-1].samples < 0.5 * max(m.samples for m in metrics[:20])
     else:
-        assert metrics[-1]["samples_per_ray"] == 48
+        assert metrics[-1].samples == 48
 
 
 @pytest.mark.parametrize("extra", [{}, {"sampler": "importance"}, {"sparsity_weight": 0.01, "colour_weight": 0.03}])
