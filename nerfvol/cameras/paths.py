@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.calibration import Calibration, lens_keys, read_calibration, read_matrix
 from nerfvol.cameras.camera import Camera, Intrinsics, orbit
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json
@@ -23,7 +23,6 @@ DEFAULT_SIZE = (800, 800)
 DEFAULT_ANGLE_X = 0.6911
 """Horizontal field of view, radians (40 degrees), where a file states none: that of the NeRF-synthetic scenes."""
 LARGEST_SIDE = 16384
-_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> list[Camera]:
@@ -32,9 +31,6 @@ def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = No
     Raises:
         InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
     """
-    # The dialects' one reader of intrinsics; its own read_cameras insists on images and focal lengths.
-    from nerfvol.cameras.calibration import read_calibration, read_matrix
-
     document = read_json(path)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -72,11 +68,9 @@ def cameras_document(cameras: Sequence[Camera], names: Sequence[str]) -> dict[st
         frame: dict[str, Any] = {
             "file_path": name, "w": lens.width, "h": lens.height,
             "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy,
-            **{key: getattr(lens, key) for key in _LENS if getattr(lens, key)},
+            **lens_keys(lens.lens),
             "transform_matrix": camera.c2w.tolist(),
         }  # fmt: skip
-        if lens.fisheye:
-            frame["camera_model"] = "OPENCV_FISHEYE"
         frames.append(frame)
     return {"frames": frames}
 

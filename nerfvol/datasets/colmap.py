@@ -16,25 +16,27 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.cameras.camera import rigid_pose
+from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.datasets.listing import Frame, ImageFinder, Listing, hold_out
 from nerfvol.datasets.llff import image_folder
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_bytes
 
 _PLACES = ("sparse/0", "colmap/sparse/0", "sparse", ".")
-# COLMAP's model ids and their parameters in its order; f stands for both focal lengths, k for k1
-_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
-    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
-    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
-    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
-    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
-    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
-    "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "rational4", "rational5", "rational6")),
-    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
-    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+# COLMAP's model ids, the lens they are, their parameters in its order; f stands for both focal lengths. What the lens has no
+# coefficient for must be zero.
+_MODELS: dict[str, tuple[int, type[Lens], str]] = {
+    "SIMPLE_PINHOLE": (0, BrownConrady, "f cx cy"),
+    "PINHOLE": (1, BrownConrady, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, BrownConrady, "f cx cy k1"),
+    "RADIAL": (3, BrownConrady, "f cx cy k1 k2"),
+    "OPENCV": (4, BrownConrady, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, Fisheye, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 rational4 rational5 rational6"),
+    "SIMPLE_RADIAL_FISHEYE": (8, Fisheye, "f cx cy k1"),
+    "RADIAL_FISHEYE": (9, Fisheye, "f cx cy k1 k2"),
 }
-_NAMES = {number: name for name, (number, _) in _MODELS.items()}
+_NAMES = {number: name for name, (number, *_) in _MODELS.items()}
 _MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
 _AROUND = 1.25  # a lens's distortion may move a point by so much from where a pinhole would show it
 _FITTING = (
@@ -84,7 +86,7 @@ def _doubt(model: Path, frames: dict[int, Frame]) -> list[str]:
     """A sentence where the model's points lie outside the images that it says show them; ``frames`` by image number."""
     binary = model / "points3D.bin"
     path = binary if binary.is_file() else model / "points3D.txt"
-    if not path.is_file() or any(frame.calibration.fisheye for frame in frames.values()):
+    if not path.is_file() or any(not isinstance(frame.calibration.lens, BrownConrady) for frame in frames.values()):
         return []
     shown: dict[int, list[tuple[float, ...]]] = {}
     points = _binary_points(path) if path == binary else _text_points(path)
@@ -130,17 +132,14 @@ def _pose(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> 
 
 
 def _calibration(model: str, width: int, height: int, parameters: tuple[float, ...]) -> Calibration:
-    values = dict(zip(_MODELS[model][1], parameters, strict=True))
+    _, lens, names = _MODELS[model]
+    values = dict(zip(names.split(), parameters, strict=True))
     rational = [name for name in ("rational4", "rational5", "rational6") if values.get(name)]
     if rational:
         raise InputError("the rational terms k4, k5, k6 of FULL_OPENCV are not supported; export undistorted images")
     if not all(np.isfinite(parameters)) or min(width, height) < 1:
         raise InputError(f"a camera must have a size and finite parameters, got {width}x{height} and {parameters}")
     focal = values.get("f")
-
-    def get(key: str) -> float:
-        return values.get(key, 0.0)
-
     return Calibration(
         width=width,
         height=height,
@@ -148,8 +147,7 @@ def _calibration(model: str, width: int, height: int, parameters: tuple[float, .
         fy=values.get("fy", focal),
         cx=values["cx"],
         cy=values["cy"],
-        distortion=(get("k1"), get("k2"), get("k3"), get("k4"), get("p1"), get("p2")),
-        fisheye="FISHEYE" in model,
+        lens=lens(**{name: values[name] for name in lens.names() if name in values}),
         resizable=True,
     )
 
@@ -191,7 +189,7 @@ def _binary_cameras(path: Path) -> dict[int, Calibration]:
             known = ", ".join(_MODELS)
             raise InputError(f"{path}, camera {camera}: lens model {number} is not supported; known models: {known}")
         model = _NAMES[number]
-        found[camera] = _checked(path, camera, model, width, height, cursor.take(f"{len(_MODELS[model][1])}d"))
+        found[camera] = _checked(path, camera, model, width, height, cursor.take(f"{len(_MODELS[model][2].split())}d"))
     return found
 
 
@@ -205,7 +203,7 @@ def _text_cameras(path: Path) -> dict[int, Calibration]:
             numbers = int(camera), int(width), int(height), tuple(map(float, parameters))
         except ValueError:
             raise InputError(f"{path}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line!r:.60}") from None
-        if model not in _MODELS or len(numbers[3]) != len(_MODELS[model][1]):
+        if model not in _MODELS or len(numbers[3]) != len(_MODELS[model][2].split()):
             raise InputError(f"{path}, camera {camera}: unknown lens model or wrong number of parameters: {line!r:.60}")
         found[numbers[0]] = _checked(path, numbers[0], model, *numbers[1:])
     return found
