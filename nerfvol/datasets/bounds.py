@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.cameras.focus import focus_point
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds, cube
 
@@ -26,20 +27,6 @@ class BoundsHint:
     aabb: NDArray[np.float64] | None = None
     aabb_scale: float | None = None
     near_far: tuple[float, float] | None = None
-
-
-def focus_point(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], float]:
-    """The point (3,) nearest to all optical axes (least squares) and how well they fix it, from 0 (parallel) to 2/3.
-
-    The latter is the smallest eigenvalue of the mean of I - d d^T: about the mean squared sine between the axes.
-    """
-    origins = np.stack([camera.position for camera in cameras])
-    axes = np.stack([camera.forward for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    matrix = across.mean(axis=0)
-    certainty = float(np.linalg.eigvalsh(matrix)[0])
-    right = (across @ origins[:, :, None]).mean(axis=0)[:, 0]
-    return np.linalg.lstsq(matrix, right, rcond=None)[0], certainty
 
 
 def _half_angle_tangent(camera: Camera) -> float:
@@ -75,12 +62,11 @@ def estimate_bounds(
     if hint.aabb is not None:
         return bounds_of_box(hint.aabb, has_alpha), "scene bounds: the aabb of the file"
     positions = np.stack([camera.position for camera in cameras])
-    center, certainty = focus_point(cameras)
-    distances = np.linalg.norm(positions - center, axis=1)
-    ahead = np.array([(center - camera.position) @ camera.forward > 0 for camera in cameras])
-    if hint.near_far is not None and certainty < _FORWARD_FACING:
+    focus = focus_point(cameras)
+    distances = np.linalg.norm(positions - focus.point, axis=1)
+    if hint.near_far is not None and focus.certainty < _FORWARD_FACING:
         return _between(cameras, hint.near_far, has_alpha)
-    if len(cameras) < 2 or certainty < 1e-3 or ahead.mean() < 0.5 or distances.max() < 1e-9:
+    if len(cameras) < 2 or not focus.is_clear or distances.max() < 1e-9:
         return _guess(cameras, has_alpha)
     if has_alpha:
         reach = [d * _half_angle_tangent(camera) for d, camera in zip(distances, cameras, strict=True)]
@@ -90,7 +76,7 @@ def estimate_bounds(
     if hint.aabb_scale is not None:
         half = min(half, 0.5 * hint.aabb_scale / _INSTANT_NGP_SCALE)
     how = "the point all cameras look at, as far as " + ("their images reach" if has_alpha else "the median camera")
-    return _around(center, half, has_alpha), f"scene bounds: a cube of half side {half:.3f} around {how}"
+    return _around(focus.point, half, has_alpha), f"scene bounds: a cube of half side {half:.3f} around {how}"
 
 
 def _between(cameras: Sequence[Camera], near_far: tuple[float, float], has_alpha: bool) -> tuple[SceneBounds, str]:
@@ -127,7 +113,7 @@ def _guess(cameras: Sequence[Camera], has_alpha: bool) -> tuple[SceneBounds, str
 
 def require_seen(bounds: SceneBounds, cameras: Sequence[Camera]) -> None:
     """Raises InputError unless at least one camera sees some of the bounds. Cameras inside them are fine."""
-    low, high = bounds.aabb if not bounds.is_unbounded else bounds.background_cube
+    low, high = bounds.aabb if bounds.background_cube is None else bounds.background_cube
     steps = np.linspace(0, 1, 9)
     grid = low + (high - low) * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     for camera in cameras:
