@@ -16,6 +16,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
 from nerfvol.datasets.listing import Frame, Listing, listed_names
 from nerfvol.datasets.llff import is_llff_folder, read_llff
+from nerfvol.datasets.store import ImageStore
 from nerfvol.datasets.transforms import is_transforms_folder, read_transforms
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds, check_box
@@ -68,9 +69,8 @@ def load_dataset(
     scene, sentence = _bounds(listing, training, scene_override, has_alpha)
     require_seen(scene, cameras)
     messages.append(sentence)
-    dataset = Dataset(cameras, images, listed_names(frames), scene, str(listing.source), messages, threads)
-    dataset.reload = lambda: decode()[0]
-    return dataset
+    store = ImageStore(len(images), lambda: decode()[0], images)
+    return Dataset(cameras, store, listed_names(frames), scene, str(listing.source), messages, threads)
 
 
 def _read_listing(path: Path, split: str) -> Listing:
