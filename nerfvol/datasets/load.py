@@ -19,6 +19,7 @@ from nerfvol.datasets.llff import is_llff_folder, read_llff
 from nerfvol.datasets.store import ImageStore
 from nerfvol.datasets.transforms import is_transforms_folder, read_transforms
 from nerfvol.errors import InputError
+from nerfvol.machine import total_memory
 from nerfvol.region import SceneBounds, check_box
 
 SPLITS = ("train", "val", "test")
@@ -129,16 +130,13 @@ def _require_one_size(frames: Sequence[Frame], sizes: Sequence[tuple[int, int]])
 
 
 def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
-    """Refuses a set of images that cannot fit in the machine's memory before any of it is decoded."""
+    """Refuses a set of images that cannot fit in memory (the machine's, or its container's limit) before decoding any."""
     need = sum(4 * camera.intrinsics.width * camera.intrinsics.height for camera in cameras)
-    try:
-        have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # a platform that does not tell; decode and see
-        return
-    if need > 0.8 * have:
+    have = total_memory()
+    if have is not None and need > 0.8 * have:  # on a platform that does not tell, decode and see
         factor = int(np.ceil(downscale * np.sqrt(need / (0.5 * have))))
         raise InputError(
-            f"{len(cameras)} images need {need / 2**30:.1f} GiB and this machine has {have / 2**30:.1f} GiB of memory; "
+            f"{len(cameras)} images need {need / 2**30:.1f} GiB and there are {have / 2**30:.1f} GiB of memory; "
             f"use a downscale of {factor} or more"
         )
 
