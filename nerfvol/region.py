@@ -70,7 +70,10 @@ def cube(center: NDArray[np.float64], half: float) -> NDArray[np.float64]:
 
 def check_box(box: ArrayLike, what: str) -> NDArray[np.float64]:
     """The box (2, 3) float64 from (2, 3) or six numbers; InputError unless finite and not empty on any axis."""
-    corners = np.asarray(box, dtype=np.float64)
+    try:
+        corners = np.asarray(box, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):  # ragged lists, text, whole numbers of hundreds of digits
+        raise InputError(f"{what} must be two corners of three numbers, got {box!r:.60}") from None
     if corners.size != 6:
         raise InputError(f"{what} must be two corners of three numbers, got shape {corners.shape}")
     corners = corners.reshape(2, 3).copy()

@@ -53,7 +53,12 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: Path, split: str) -> Listing:
+def recognises(path: Path) -> bool:
+    """Whether the folder holds a COLMAP model."""
+    return find_model(path) is not None
+
+
+def read(folder: Path, split: str) -> Listing:
     """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken."""
     model = find_model(folder)
     if model is None:
