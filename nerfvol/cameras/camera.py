@@ -30,7 +30,7 @@ Float = NDArray[np.float64]
 TILE_SIDE = 8
 RIGID_TOLERANCE = 1e-3
 _CACHE_BYTES = 256 << 20
-_FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
+FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
 
 
 def _coefficient(name: str) -> property:
@@ -82,6 +82,11 @@ class Intrinsics:
     def fisheye(self) -> bool:
         """Whether the lens is a Fisheye."""
         return isinstance(self.lens, Fisheye)
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """The lens's coefficients in their order; all are 0 for a lens that does nothing to its model."""
+        return tuple(self.lens.coefficients.values())
 
     def _check(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -227,8 +232,8 @@ def rigid_pose(c2w: ArrayLike) -> Float:
         raise InputError(f"a camera pose must be a 4x4 (or 3x4) matrix, got shape {matrix.shape}")
     if not np.isfinite(matrix).all():
         raise InputError("a camera pose must hold finite numbers only, got NaN or infinity")
-    if not np.abs(matrix[:3, 3]).max() < _FARTHEST:
-        raise InputError(f"a camera must be within {_FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
+    if not np.abs(matrix[:3, 3]).max() < FARTHEST:
+        raise InputError(f"a camera must be within {FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InputError(f"the last row of a camera pose must be 0 0 0 1, got {_numbers(matrix[3])}")
     r = matrix[:3, :3]

@@ -2,7 +2,7 @@
 
 Here axes are OpenCV's: x right, y down, z forward; positions on the image plane are in focal lengths from the principal
 point. A further model is a class here, a row in the table of names that JSON files use (cameras/calibration.py) and a
-row in COLMAP's (datasets/colmap.py).
+row in COLMAP's (datasets/colmap_files.py).
 """
 
 from __future__ import annotations

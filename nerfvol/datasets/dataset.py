@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar, overload
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads
+from nerfvol.datasets.points import ModelPoints
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
@@ -29,6 +31,7 @@ class Dataset:
     ImageStore where they came from files.
     ``names``: one a view, unique, fit for a file name. ``source``: the file the poses came from.
     ``messages``: sentences a person should see (frames left out, how the split was made, how the bounds were found).
+    ``threads``: that decode and average; one for every core by default. ``read_points``: see :attr:`points`.
 
     dataclasses.replace makes a dataset of other cameras, images, bounds; what is not replaced is shared, the store of images
     too.
@@ -41,6 +44,7 @@ class Dataset:
     source: str
     messages: list[str] = field(default_factory=list)
     threads: int | None = None
+    read_points: Callable[[], ModelPoints] | None = None
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -54,6 +58,15 @@ class Dataset:
     def can_reload(self) -> bool:
         """Whether the images came from files, so that :meth:`release` does something."""
         return isinstance(self.images, ImageStore)
+
+    @functools.cached_property
+    def points(self) -> ModelPoints | None:
+        """The points that were found with the poses, read when first asked for; None where the format has none.
+
+        Raises:
+            InputError: their file is damaged.
+        """
+        return None if self.read_points is None else self.read_points()
 
     def release(self) -> None:
         """Give up the images' memory, where they can be read again: whoever asks for one of them next does so."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from nerfvol.errors import InputError
 
@@ -40,7 +40,7 @@ class Format:
 
     @property
     def reader(self) -> Reader:
-        return cast(Reader, importlib.import_module(f"{__package__}.{self.module}"))
+        return cast(Any, importlib.import_module(f"{__package__}.{self.module}"))
 
 
 FORMATS = (

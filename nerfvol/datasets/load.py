@@ -68,7 +68,8 @@ def load_dataset(
     require_seen(scene, cameras)
     messages.append(sentence)
     store = ImageStore(len(images), lambda: decode()[0], images)
-    return Dataset(cameras, store, listed_names(frames), scene, str(listing.source), messages, threads)
+    names, source = listed_names(frames), str(listing.source)
+    return Dataset(cameras, store, names, scene, source, messages, threads, listing.read_points)
 
 
 def _present(listing: Listing, messages: list[str]) -> list[Frame]:

@@ -162,16 +162,18 @@ def write_colmap(folder: Path, cameras, images, *, model="OPENCV", text=False, s
 
 
 def write_points(folder: Path, cameras, places, *, text=False) -> None:
-    """points3D beside the model: each camera (numbered from 1) shows all ``places`` (n, 3)."""
+    """points3D beside the model: each camera (numbered from 1) shows all ``places`` (n, 3), of colour (1, 2, 250)."""
     target = folder / "sparse" / "0"
     track = [n for i in range(len(cameras)) for n in (i + 1, 0)]
     if text:
-        rows = [f"{i} {x} {y} {z} 1 2 3 0.5 " + " ".join(map(str, track)) for i, (x, y, z) in enumerate(places)]
+        rows = [f"{i} {x} {y} {z} 1 2 250 0.5 " + " ".join(map(str, track)) for i, (x, y, z) in enumerate(places)]
         (target / "points3D.txt").write_text("# Points\n" + "\n".join(rows) + "\n")
         return
     data = struct.pack("<Q", len(places))
     for i, place in enumerate(places):
-        data += struct.pack("<Q3d3BdQ", i, *place, 1, 2, 3, 0.5, len(cameras)) + struct.pack(f"<{len(track)}i", *track)
+        data += struct.pack("<Q3d3BdQ", i, *place, 1, 2, 250, 0.5, len(cameras)) + struct.pack(
+            f"<{len(track)}i", *track
+        )
     (target / "points3D.bin").write_bytes(data)
 
 

@@ -81,4 +81,7 @@ def test_cup():
     (lens,) = {camera.intrinsics for camera in train.cameras + held.cameras}
     assert lens.fx == lens.fy and lens.k1 != 0 and lens.k2 == 0  # SIMPLE_RADIAL
     assert focus_point(train.cameras).certainty > 0.3
+    points = train.points
+    assert len(points) == 2274 and 0.3 < points.errors.mean() < 1 and points.track_lengths.min() >= 2
+    assert points.colours.std() > 10
     assert not any("tracks" in message for message in train.messages)  # the points are where the photographs show them
