@@ -111,6 +111,22 @@ def write_llff(folder: Path, cameras, images, *, factor=4, near_far=(2.0, 9.0)) 
     return folder
 
 
+def write_nsvf(folder: Path, cameras, images, *, prefixes=("0_",), box=None) -> Path:
+    """intrinsics.txt, pose and rgb; image i's name begins with prefixes[i % len(prefixes)]."""
+    (folder / "pose").mkdir(parents=True)
+    (folder / "rgb").mkdir()
+    k = cameras[0].intrinsics
+    matrix = [[k.fx, 0, k.cx, 0], [0, k.fy, k.cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    np.savetxt(folder / "intrinsics.txt", matrix, fmt="%.17g")
+    for i, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        name = f"{prefixes[i % len(prefixes)]}view_{i:03d}"
+        Image.fromarray(image).save(folder / "rgb" / f"{name}.png")
+        np.savetxt(folder / "pose" / f"{name}.txt", camera.c2w * (1, -1, -1, 1), fmt="%.17g")
+    if box is not None:
+        (folder / "bbox.txt").write_text(" ".join(map(str, [*box, 0.4])))
+    return folder
+
+
 def quaternion(rotation: np.ndarray) -> np.ndarray:
     """(w, x, y, z) of a rotation: the eigenvector of the symmetric matrix that measures agreement (Bar-Itzhack)."""
     r = rotation

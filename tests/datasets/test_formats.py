@@ -16,6 +16,7 @@ WRITERS = {
     "transforms": scenes.write_instant_ngp,
     "llff": scenes.write_llff,
     "colmap": scenes.write_colmap,
+    "nsvf": scenes.write_nsvf,
 }
 BOX = [-0.5, -1, -1.5, 0.5, 1, 2]
 

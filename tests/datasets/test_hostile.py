@@ -31,6 +31,8 @@ FILES = {
     "colmap cameras": (scenes.write_colmap, "sparse/0/cameras.bin"),
     "colmap images": (scenes.write_colmap, "sparse/0/images.bin"),
     "colmap points": (write_colmap_with_points, "sparse/0/points3D.bin"),
+    "nsvf intrinsics": (scenes.write_nsvf, "intrinsics.txt"),
+    "nsvf pose": (scenes.write_nsvf, "pose/0_view_001.txt"),
     "transforms": (scenes.write_instant_ngp, "transforms.json"),
     "image": (scenes.write_instant_ngp, "images/view_003.png"),
 }
@@ -56,7 +58,7 @@ def templates(tmp_path_factory):
     return root
 
 
-@pytest.mark.parametrize("name", ["llff", "colmap cameras", "colmap images", "colmap points", "transforms"])
+@pytest.mark.parametrize("name", [name for name in FILES if name != "image"])
 @SETTINGS
 @given(st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=8), st.floats(0.3, 1.5))
 def test_flipped_and_missing_bytes(templates, name, flips, kept):
