@@ -226,7 +226,14 @@ class Camera:
 
 
 def rigid_pose(c2w: ArrayLike) -> Float:
-    """The (4, 4) float64 pose, with the nearest exact rotation, of a camera-to-world matrix (4, 4) or (3, 4)."""
+    """The (4, 4) float64 pose, with the nearest exact rotation, of a camera-to-world matrix (4, 4) or (3, 4).
+
+    The rotation nearest to a matrix U S V^T, in least squares, is U V^T (the orthogonal Procrustes problem, Schönemann
+    1966).
+
+    Raises:
+        InputError: the matrix is no rigid pose to within 1e-3, is not finite or lies beyond 1e15 units.
+    """
     matrix = np.asarray(c2w, dtype=np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"a camera pose must be a 4x4 (or 3x4) matrix, got shape {matrix.shape}")
@@ -269,7 +276,11 @@ def tile_pixels(width: int, height: int) -> NDArray[np.int64]:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float:
-    """The pose (4, 4) at ``eye`` that looks at ``target`` with ``up`` upwards in the image."""
+    """The pose (4, 4) at ``eye`` (3,) that looks at ``target`` (3,) with ``up`` (3,) upwards in the image.
+
+    Raises:
+        InputError: ``up`` is along the line of sight, or the two points are one.
+    """
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     back = eye - target
     right = np.cross(up, back)
@@ -294,6 +305,9 @@ def orbit(
 
     ``radius`` is the distance to ``center``, ``elevation_deg`` the angle above the plane through ``center`` normal to
     ``up`` (-90 < elevation < 90). The first camera's azimuth is toward the world axis least aligned with ``up``.
+
+    Raises:
+        InputError: no view, no radius, or an elevation at a pole.
     """
     if n < 1 or not radius > 0 or not -90 < elevation_deg < 90:
         raise InputError(

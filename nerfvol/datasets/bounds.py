@@ -36,9 +36,9 @@ def _half_angle_tangent(camera: Camera) -> float:
 
 
 def bounds_of_box(box: NDArray[np.float64], has_alpha: bool) -> SceneBounds:
-    """A stated region of detail (2, 3), with the surroundings that photographs need."""
-    surroundings = cube(box.mean(axis=0), BACKGROUND_FACTOR * float((box[1] - box[0]).max()) / 2)
-    return SceneBounds(box, None if has_alpha else surroundings, has_alpha)
+    """Bounds with a stated aabb (2, 3), scene units, and around photographs the background cube, 16 times as large."""
+    background = cube(box.mean(axis=0), BACKGROUND_FACTOR * float((box[1] - box[0]).max()) / 2)
+    return SceneBounds(box, None if has_alpha else background, has_alpha)
 
 
 def _around(center: NDArray[np.float64], half: float, has_alpha: bool) -> SceneBounds:
@@ -48,13 +48,13 @@ def _around(center: NDArray[np.float64], half: float, has_alpha: bool) -> SceneB
 def estimate_bounds(
     cameras: Sequence[Camera], has_alpha: bool, hint: BoundsHint | None = None
 ) -> tuple[SceneBounds, str]:
-    """Bounds from the cameras and what the file says, with a sentence on how they were found.
+    """Bounds, in scene units, from the cameras (at least one) and what the file says; a sentence on how they were found.
 
     - An explicit aabb is taken as it is.
     - Objects on a transparent background: a cube around the point all cameras look at, as large as their images reach
       there: half = 1.03 x distance x tan(half the field of view), 90th percentile over the cameras. NeRF-synthetic
       (distance 4.03, 0.691 rad) gives 1.495: the classical [-1.5, 1.5]^3.
-    - Photographs around a subject: the cube reaches to the median camera, its surroundings 16 times as far.
+    - Photographs around a subject: the cube reaches to the median camera, the background cube 16 times as far.
     - Forward-facing photographs with near/far: the cube holds what the cameras see between the two.
     - instant-ngp's aabb_scale is an upper bound on the region of detail.
     """
@@ -112,7 +112,14 @@ def _guess(cameras: Sequence[Camera], has_alpha: bool) -> tuple[SceneBounds, str
 
 
 def require_seen(bounds: SceneBounds, cameras: Sequence[Camera]) -> None:
-    """Raises InputError unless at least one camera sees some of the bounds. Cameras inside them are fine."""
+    """Refuses bounds of which no camera sees anything. Cameras inside them are fine.
+
+    Looked at: whether points of a grid in the bounds lie in an image or, for bounds narrower than the grid sees, rays of an
+    image meet them (slabs, Kay and Kajiya 1986).
+
+    Raises:
+        InputError: no camera sees any of the bounds.
+    """
     low, high = bounds.aabb if bounds.background_cube is None else bounds.background_cube
     steps = np.linspace(0, 1, 9)
     grid = low + (high - low) * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)

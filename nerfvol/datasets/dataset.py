@@ -82,7 +82,7 @@ class Dataset:
         return replace(self, cameras=cameras, images=images, names=names)
 
     def smaller(self, k: int, background: Sequence[float]) -> Dataset:
-        """All views area-averaged over k x k pixels, over a background (3,) in [0, 1]."""
+        """All views area-averaged over k x k pixels, over a background (3,) in [0, 1]; InputError where nothing is left."""
         cameras = [camera.scaled(k) for camera in self.cameras]
         return replace(self, cameras=cameras, images=self.pyramid(background, k))
 
@@ -98,8 +98,11 @@ class Dataset:
         return replace(self, cameras=cameras, images=images)
 
     def before_a_lens(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which points (n, 3) are right before a camera, (n,): what is there is seen by no other and would only explain
-        that one picture. None in scenes without surroundings, whose cameras stand outside."""
+        """Which points (n, 3) are right before a camera, (n,) bool: what is there is seen by no other and would only explain
+        that one picture. None in scenes without a background of their own, whose cameras are outside.
+
+        ``points`` are in scene units; right before is within NEAR_SHARE of the cameras' median distance to the middle.
+        """
         hidden = np.zeros(len(points), dtype=bool)
         if not self.scene.is_unbounded:
             return hidden

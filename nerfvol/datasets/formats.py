@@ -40,6 +40,7 @@ class Format:
 
     @property
     def reader(self) -> Reader:
+        """The format's file, imported now."""
         return cast(Any, importlib.import_module(f"{__package__}.{self.module}"))
 
 

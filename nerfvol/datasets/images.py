@@ -63,7 +63,7 @@ def _open(path: Path) -> Image.Image:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels from the file's header alone."""
+    """(width, height) in pixels from the file's header alone; InputError where it is no image, damaged or too large."""
     with _open(path) as image:
         return image.size
 
@@ -72,6 +72,9 @@ def read_image(path: Path) -> UInt8:
     """The image as uint8: (h, w, 4) where the file has transparency, else (h, w, 3); grey and palettes are expanded.
 
     16-bit channels are reduced to 8. EXIF orientation is not applied: poses refer to pixels as stored.
+
+    Raises:
+        InputError: there is no such image, it is damaged, has 32 bits a channel or more than MAX_PIXELS.
     """
     with _open(path) as image:
         try:

@@ -34,7 +34,7 @@ def recognises(path: Path) -> bool:
 def read(folder: Path, split: str) -> Listing:
     """The listing of one split, by the first two letters of the images' names; without such every 8th is held out.
 
-    Where only one of validation and test exists it stands for both. ``bbox.txt``, where there is one, is the aabb.
+    Where only one of validation and test exists it is used for both. ``bbox.txt``, where there is one, is the aabb.
     """
     calibration, source = _calibration(folder / INTRINSICS), folder / INTRINSICS
     hint = BoundsHint(aabb=_box(folder / BOX) if (folder / BOX).is_file() else None)

@@ -1,4 +1,4 @@
-"""The points that structure from motion found beside the cameras: where splats may begin."""
+"""The points that structure from motion found with the cameras: where splats may begin."""
 
 from __future__ import annotations
 

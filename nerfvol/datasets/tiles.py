@@ -15,7 +15,7 @@ from nerfvol.native import native
 
 @dataclass
 class Cursor:
-    """Where one of the two shuffled queues stands: position inside an epoch's permutation."""
+    """How far one of the two shuffled queues is: position inside an epoch's permutation."""
 
     epoch: int = 0
     position: int = 0
@@ -60,10 +60,12 @@ class TileBank:
 
     @property
     def n_tiles(self) -> int:
+        """Tiles of all images."""
         return len(self.image)
 
     @property
     def n_rays(self) -> int:
+        """Rays of all tiles, padding included."""
         return self.n_tiles * TILE_RAYS
 
     def draw(self, n: int, rich_share: float, seed: int, rich: Cursor, plain: Cursor) -> Batch:

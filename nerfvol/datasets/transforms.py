@@ -29,7 +29,7 @@ def recognises(path: Path) -> bool:
 def read(path: Path, split: str) -> Listing:
     """The listing of one split of a folder with transforms*.json, or of one such file.
 
-    transforms_{train,val,test}.json are used as they are; where only one of val and test exists it stands for both. A
+    transforms_{train,val,test}.json are used as they are; where only one of val and test exists it is used for both. A
     single transforms.json is split by its own train/val/test_filenames or, without them, by holding out every 8th view.
     """
     if path.is_file():
