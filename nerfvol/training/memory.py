@@ -124,7 +124,7 @@ def estimate_training(
     beside = beside or Beside()
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
     octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
-    growth = 0 if dataset.reload is None or vertices is not None else change + octree // 2
+    growth = 0 if not dataset.can_reload or vertices is not None else change + octree // 2
     tiles = int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
     return MemoryEstimate(
         base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
