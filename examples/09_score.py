@@ -11,7 +11,7 @@ from pathlib import Path
 import data_synth as ds
 import nerfvol
 from nerfvol.files import pictures
-from nerfvol.measure.scores import evaluate_octree
+from nerfvol.measure.scores import score_views
 from nerfvol.octree.io import load_octree
 
 SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "until": [0.4, 1.0], "tiles": [64, 96], "prunes": [2, 2]}
@@ -21,9 +21,13 @@ if not run.exists():  # a small one
     nerfvol.train(data=scene, out=run, octree=SHORT)
 octree, metadata = load_octree(run / "octree.safetensors")
 views, background = nerfvol.load_dataset(scene, "test"), metadata["background"]
-
 pairs = {}
-scores = evaluate_octree(octree, views, background, on_view=lambda i, truth, render: pairs.update({i: (truth, render)}))
+scores = score_views(
+    lambda camera: nerfvol.render_image(octree, camera, background, outputs=("rgb",))["rgb"],
+    views,
+    background,
+    on_view=lambda i, truth, image: pairs.update({i: (truth, image)}),
+)
 for row in scores["rows"]:
     print(f"{row['name']:>8}  {row['psnr']:6.2f} dB  {row['ssim']:.4f}")
 print(f"    mean  {scores['psnr']:6.2f} dB  {scores['ssim']:.4f}   over background {background}")
