@@ -66,9 +66,9 @@ def _read_binary(path: Path) -> _Columns:
     rows = np.empty(count, np.int64)
     at, length = 8, struct.Struct("<Q")
     for i in range(count):
-        rows[i] = at
         if at + _ROW.itemsize > len(data):
             raise truncated
+        rows[i] = at
         at += _ROW.itemsize + 8 * length.unpack_from(data, at + _ROW.itemsize - 8)[0]
     if at > len(data):
         raise truncated
