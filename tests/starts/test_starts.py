@@ -52,7 +52,8 @@ def test_neighbours_are_exact(points, monkeypatch):
 
 def test_neighbours_where_there_are_few():
     squared, index = nearest([[0.0, 0, 0], [0, 3, 4]], 3)
-    assert squared[:, 0].tolist() == [25, 25] and np.isinf(squared[:, 1:]).all() and index.tolist() == [[1, -1, -1], [0, -1, -1]]
+    assert squared[:, 0].tolist() == [25, 25] and np.isinf(squared[:, 1:]).all()
+    assert index.tolist() == [[1, -1, -1], [0, -1, -1]]
     assert nearest(np.zeros((0, 3)), 2, [[0.0, 0, 0]])[1].tolist() == [[-1, -1]]
     for bad in ([[np.nan, 0, 0]], [[0.0, 0]]):
         with pytest.raises(ValueError, match="finite numbers of shape"):
