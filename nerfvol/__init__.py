@@ -76,7 +76,7 @@ def train(config: Config | None = None, /, **settings: Any) -> Path:
     from nerfvol.errors import InputError
     from nerfvol.kernels.threads import set_threads
     from nerfvol.machine import usable_cores
-    from nerfvol.training.prepare import prepare_run, resumable_config
+    from nerfvol.training.prepare import resumable_config
     from nerfvol.training.train import train
 
     started = time.perf_counter()
@@ -90,6 +90,6 @@ def train(config: Config | None = None, /, **settings: Any) -> Path:
             raise InputError(f"train needs {name!r}: the folder of {'posed images' if name == 'data' else 'the run'}")
     if not Path(chosen.data).exists():
         raise InputError(f"{chosen.data}: no such folder or file")
-    prepare_run(chosen)
     set_threads(chosen.threads or usable_cores())
-    return train(chosen, started)
+    train(chosen, started)
+    return Path(chosen.out)
