@@ -58,6 +58,7 @@ class Model(Protocol):
 
 FORMATS = {
     "nerfvol octree": "nerfvol.views:OctreeModel",
+    "nerfvol splats": "nerfvol.views:SplatModel",
 }
 """The ``format`` key of a file's document, and the class whose ``load`` opens it."""
 

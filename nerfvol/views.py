@@ -11,16 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera, Intrinsics
+from nerfvol.cameras.through_lens import through_lens
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
 from nerfvol.kernels import ops
+from nerfvol.kernels.splat_ops import render_splats
+from nerfvol.kernels.splat_state import view_of
 from nerfvol.kernels.state import OUTPUTS, in_squares
 from nerfvol.octree.io import Storage, load_octree, save_octree
 from nerfvol.octree.tree import Octree
+from nerfvol.splats.io import load_splats, save_splats
+from nerfvol.splats.packing import PackedSplats, as_packed, unpack
+from nerfvol.splats.splats import Splats
 
 if TYPE_CHECKING:
     from nerfvol.models import Model
 
 Float = NDArray[np.float32]
+NEAREST = 1e-3
+"""Of the extent of splats: what is nearer to a camera is not drawn, where the file says no more."""
 
 
 def render_image(
@@ -132,4 +140,78 @@ class OctreeModel:
             "filled_share": float((8.0 ** -levels.astype(float) * counts).sum()),
             "leaf_bounds": self.aabb().tolist(),
             "bytes_in_memory": sum(int(array.nbytes) for array in (*arrays, *masks)),
+        }
+
+
+class SplatModel:
+    """Gaussian splats as a model (models.Model). ``splats``: Splats, or packed as the kernels keep them.
+
+    ``metadata`` may hold "near": what is nearer to a camera's plane is not drawn, scene units.
+    """
+
+    kind = "splats"
+
+    def __init__(self, splats: Splats | PackedSplats, metadata: Mapping[str, Any] | None = None) -> None:
+        self.packed, self.metadata = as_packed(splats), dict(metadata or {})
+        self._near = float(self.metadata.get("near") or NEAREST * self._extent())
+
+    @property
+    def splats(self) -> Splats:
+        """A copy as plain arrays."""
+        return unpack(self.packed)
+
+    def _extent(self) -> float:
+        """Half the width of the middle 80 % of the means, scene units."""
+        if not self.packed.n:
+            return 1.0
+        rows = [self.packed.params[:, k].reshape(-1)[: self.packed.n] for k in range(3)]
+        return float(max(np.subtract(*np.quantile(row, (0.9, 0.1))) for row in rows)) / 2 or 1.0
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SplatModel:
+        """The model in a file of splats; InputError where it is none."""
+        return cls(*load_splats(path))
+
+    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
+        """See models.Model; splats have one storage."""
+        return save_splats(path, self.splats, self.metadata)
+
+    def render(
+        self,
+        camera: Camera,
+        background: Sequence[float] | None = None,
+        outputs: Sequence[str] = ("rgb",),
+        early_stop_eps: float = DEFAULT_EARLY_STOP,
+        lod: float = DEFAULT_LOD,
+    ) -> dict[str, Float]:
+        """See models.Model; through any lens. ``lod`` changes nothing: splats have no levels."""
+        colour = self.metadata.get("background", WHITE) if background is None else background
+
+        def pinhole(seen: Camera) -> dict[str, Float]:
+            view = view_of(seen, self.packed.origin, self._near)
+            return render_splats(self.packed, view, colour, early_stop_eps, outputs)
+
+        return through_lens(pinhole, camera)
+
+    def aabb(self) -> NDArray[np.float64]:
+        """(2, 3) corners of the box around the middle 98 % of the means, three deviations wide: few lie far out."""
+        splats = self.splats
+        low, high = (np.quantile(splats.means, q, axis=0) for q in (0.01, 0.99)) if splats.n else (0.0, 0.0)
+        middle = ((splats.means >= low) & (splats.means <= high)).all(1)
+        return splats.select(middle).aabb() if middle.any() else splats.aabb()
+
+    def describe(self) -> dict[str, Any]:
+        """Count, degree, mode, quantiles of opacity and of the longest scale, bounding box, bytes in memory."""
+        splats = self.splats
+        opacity = 1 / (1 + np.exp(-splats.logits.astype(np.float64)))
+        longest = np.exp(splats.log_scales.max(1, initial=-np.inf)) if splats.n else np.zeros(1)
+        levels = (0.1, 0.5, 0.9)
+        return {
+            "splats": splats.n,
+            "sh_degree": splats.sh_degree,
+            "mode": splats.mode,
+            "opacity_quantiles": np.quantile(opacity, levels).round(4).tolist() if splats.n else [],
+            "scale_quantiles": [float(f"{x:.4g}") for x in np.quantile(longest, levels)],
+            "aabb": self.aabb().tolist(),
+            "bytes_in_memory": int(self.packed.params.nbytes),
         }

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from nerfvol.config.values import Colour, Count, Seconds, box, seconds
+from nerfvol.config.splats import SplatConfig
+from nerfvol.config.values import Colour, Count, Seconds, box, filled, seconds
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:
@@ -262,10 +262,7 @@ PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_e
 """Settings of an octree where nothing else is said."""
 
 
-def filled(settings: T, automatic: Mapping[str, Any]) -> T:
-    """The dataclass ``settings`` with a value of ``automatic`` for each of these that is None."""
-    chosen = {name: value for name, value in automatic.items() if getattr(settings, name) is None}
-    return dataclasses.replace(cast(Any, settings), **chosen)
+OCTREE_STARTS = ("direct", "mlp")
 
 
 @dataclass
@@ -276,8 +273,13 @@ class Config:
     """Folder (or transforms JSON) of posed images."""
     out: str = ""
     """Run folder."""
-    init: Literal["mlp", "direct"] = "direct"
-    """Where the octree starts: a small MLP field that is trained and distilled, or an octree of low density."""
+    representation: Literal["auto", "octree", "splats"] = "auto"
+    """What is trained. auto: splats on photographs, which are sharper and sooner so; the octree, which has a density, on
+    objects with a transparent background and on media."""
+    init: str = "auto"
+    """Where it starts. An octree: "mlp", a small field that is trained and distilled, or "direct", low density everywhere
+    (auto). Splats: "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "random", or a
+    file of splats (auto: what there is)."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     background: Colour = (1.0, 1.0, 1.0)
@@ -303,7 +305,13 @@ class Config:
     """Section: the field's way into the octree (DistillConfig)."""
     octree: OctreeConfig = dataclasses.field(default_factory=OctreeConfig)
     """Section: the octree and its optimisation (OctreeConfig)."""
+    splats: SplatConfig = dataclasses.field(default_factory=SplatConfig)
+    """Section: Gaussian splats and their optimisation (config.splats)."""
 
     def for_scene(self, scene: SceneBounds) -> Config:
         """The same with a number for each setting that the kind of scene decides."""
-        return dataclasses.replace(self, octree=self.octree.for_scene(scene), distill=self.distill.for_scene(scene))
+        sections = {name: getattr(self, name).for_scene(scene) for name in ("octree", "distill", "splats")}
+        chosen = self.representation
+        if chosen == "auto":
+            chosen = "octree" if self.init in OCTREE_STARTS else "splats" if scene.is_unbounded else "octree"
+        return dataclasses.replace(self, **sections, representation=chosen)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 from nerfvol.errors import InputError
 
@@ -230,4 +231,13 @@ def box(value: Any) -> Any:
     return numbers
 
 
+T = TypeVar("T")
+
+
 Size = Annotated[tuple[int, int], image_size]
+
+
+def filled(settings: T, automatic: Mapping[str, Any]) -> T:
+    """The dataclass ``settings`` with a value of ``automatic`` for each of these that is None."""
+    chosen = {name: value for name, value in automatic.items() if getattr(settings, name) is None}
+    return dataclasses.replace(cast(Any, settings), **chosen)

@@ -9,7 +9,8 @@ from nerfvol.errors import InputError
 
 CONFIG = "config.yaml"
 OCTREE = "octree.safetensors"
-PRODUCTS = (OCTREE,)
+SPLATS = "splats.safetensors"
+PRODUCTS = (OCTREE, SPLATS)
 """Models that a finished run may hold."""
 CHECKPOINT = "checkpoint.safetensors"
 DISTILLED = "distilled.safetensors"

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.kernels.ops import OUTPUTS, check_background, check_early_stop
+from nerfvol.defaults import WHITE
+from nerfvol.kernels.checks import check_background, check_early_stop
 from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatReport, SplatState, SplatView, view_of
+from nerfvol.kernels.state import OUTPUTS
 from nerfvol.native import aligned_empty, native
-from nerfvol.settings import WHITE
 from nerfvol.splats.packing import PackedSplats, as_packed
 from nerfvol.splats.splats import Splats
 

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 from nerfvol.native import aligned, aligned_empty, native
-from nerfvol.settings import WHITE
 from nerfvol.splats import packing
 from nerfvol.splats.packing import LANES, PackedSplats
 from nerfvol.splats.splats import Splats, rotations
 
 if TYPE_CHECKING:
-    from nerfvol.cameras import Camera
+    from nerfvol.cameras.camera import Camera
 
 NEAR_SHARE = 0.02
 """The near plane as a share of the subject's distance, where nobody says more."""

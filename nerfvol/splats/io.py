@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from nerfvol import __version__
-from nerfvol.arrayfile import ArrayFile, write_arrays
 from nerfvol.errors import InputError
+from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.splats.splats import Splats
 
 FORMAT = "nerfvol splats"

@@ -125,7 +125,9 @@ def _check_columns(file: PlyFile) -> int:
         raise file.fault(f"its vertices have no property {missing[0]!r} ({what})")
     integers = [name for name in wanted if file.dtypes[name].kind != "f"]
     if integers:
-        raise file.fault(f"its property {integers[0]!r} should be float or double, it is {file.dtypes[integers[0]].name}")
+        raise file.fault(
+            f"its property {integers[0]!r} should be float or double, it is {file.dtypes[integers[0]].name}"
+        )
     rest = sum(name.startswith("f_rest_") for name in file.dtypes)
     degree = math.isqrt(rest // 3 + 1) - 1
     if rest != 3 * ((degree + 1) ** 2 - 1) or degree > MAX_DEGREE:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
-from nerfvol.files import atomic_write, explain_os_error
+from nerfvol.files.atomic import atomic_write, explain_os_error
 
 MAX_HEADER = 1 << 16
 MOST_PROPERTIES = 512
@@ -133,7 +133,9 @@ class PlyFile:
             row = 2 * len(self.dtypes)  # a digit and a space or the line's end
         have = self._size - self._rows_at + (self.format == "ascii")
         if self.count * row > have:
-            raise self.fault(f"it declares {self.count} vertices, which need {self.count * row} bytes, and holds {have}")
+            raise self.fault(
+                f"it declares {self.count} vertices, which need {self.count * row} bytes, and holds {have}"
+            )
 
     def read(self) -> dict[str, NDArray]:
         """The vertices' properties by name, each an array (count,) of native byte order."""

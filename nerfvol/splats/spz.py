@@ -17,7 +17,7 @@ from types import ModuleType
 import numpy as np
 
 from nerfvol.errors import InputError
-from nerfvol.files import atomic_write, explain_os_error
+from nerfvol.files.atomic import atomic_write, explain_os_error
 from nerfvol.splats.splats import Splats
 
 VERSIONS = (3, 4)
@@ -59,7 +59,9 @@ def save_spz(path: str | os.PathLike[str], splats: Splats, version: int = 3) -> 
     largest = float(np.abs(means).max(initial=0.0))
     bits = _POSITION_BITS if largest <= 1 else _POSITION_BITS - int(np.ceil(np.log2(largest * (1 + 1e-6))))
     if bits < 0:
-        raise InputError(f"cannot write {path}: positions reach {largest:g}, an .spz file holds up to {2**_POSITION_BITS}")
+        raise InputError(
+            f"cannot write {path}: positions reach {largest:g}, an .spz file holds up to {2**_POSITION_BITS}"
+        )
     lengths = np.linalg.norm(splats.quats.astype(np.float64), axis=1, keepdims=True)
     data = gsply.GSData(
         means=means.astype(np.float32), scales=splats.log_scales,

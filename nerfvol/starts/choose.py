@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.splats.points import PointCloud
 from nerfvol.starts.model_points import model_points, points_file
 from nerfvol.starts.plane_sweep import SweepView, plane_sweep, sweep_factor
 from nerfvol.starts.random import random_points
 from nerfvol.starts.subject import Subject, subject_of
-from nerfvol.training.photographs import Photographs
 
 FEW_POINTS = 4_000
 """A model with fewer points gets those of a plane sweep beside them."""
@@ -50,7 +50,10 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
         raise InputError(f"the start {name!r} cannot be used: {found}")
     if not len(cloud):
         cloud = random_points(dataset.scene, seed=seed)
-        found, chosen = f"{found}; {len(cloud)} random points in the scene's box stand in, expect a poor result", "random"
+        found, chosen = (
+            f"{found}; {len(cloud)} random points in the scene's box stand in, expect a poor result",
+            "random",
+        )
     return Start(cloud, subject, chosen, f"start: {found} ({why})")
 
 

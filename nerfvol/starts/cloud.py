@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras import Camera
+from nerfvol.cameras.camera import Camera
 from nerfvol.errors import InputError
 from nerfvol.splats.neighbours import nearest
 from nerfvol.splats.points import PointCloud, dc_of_colour, logit, spacing

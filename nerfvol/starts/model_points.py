@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
-from nerfvol.files import read_bytes
+from nerfvol.files.atomic import read_bytes
 from nerfvol.splats.points import PointCloud
 
 SHORTEST_TRACK = 3

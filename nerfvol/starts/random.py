@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerfvol.datasets.dataset import SceneBounds
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 from nerfvol.splats.points import PointCloud
 
 POINTS = 3_000

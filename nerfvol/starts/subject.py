@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras import Camera
-from nerfvol.datasets.bounds import focus_point
+from nerfvol.cameras.camera import Camera
+from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.llff import POSES
 
@@ -44,10 +44,8 @@ def subject_of(dataset: Dataset) -> Subject:
 def subject_distance(cameras: Sequence[Camera], otherwise: NDArray[np.float64]) -> float:
     """The median distance of the cameras to the point nearest to all their axes; ``otherwise`` (3,) where none is ahead."""
     positions = np.stack([camera.position for camera in cameras])
-    point, certainty = focus_point(cameras)
-    ahead = np.mean([(point - camera.position) @ camera.forward > 0 for camera in cameras])
-    if certainty < _MEETING or ahead < 0.5:
-        point = otherwise
+    focus = focus_point(cameras)
+    point = otherwise if focus.certainty < _MEETING or focus.ahead < 0.5 else focus.point
     distance = float(np.median(np.linalg.norm(positions - point, axis=1)))
     return distance if distance > 1e-9 else 1.0
 

@@ -11,14 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfvol.config.splats import SplatConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.photographs import Photographs, estimate_bytes
 from nerfvol.datasets.tiles import rich_share
 from nerfvol.errors import InputError
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
 from nerfvol.octree.rows import BLOCKS
 from nerfvol.octree.tree import Octree
+from nerfvol.training.splat_schedule import Schedule
 
 BASE_BYTES = 160 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
@@ -190,6 +193,29 @@ def splits_within(split: np.ndarray, gain: np.ndarray, most: int | None) -> np.n
     kept = np.zeros(len(split), dtype=bool)
     kept[wanted[np.argsort(-gain[wanted], kind="stable")[:room]]] = True
     return kept
+
+
+SPLAT_BYTES = 3 * 4 + 84 + 6 * 81
+"""Per Gaussian, beside its parameters and moments: statistics, a record, and gradients of six tiles (mostly 4 to 8)."""
+
+
+def splat_memory(photographs: Photographs, schedule: Schedule, config: SplatConfig, held_out_bytes: int) -> str:
+    """The estimate of training ``schedule.most`` splats, in words; InputError where that does not fit in the memory at hand."""
+    images = estimate_bytes(photographs.cameras, schedule.factors) + held_out_bytes
+    row = 4 * (11 + 3 * ((config.sh_degree or 0) + 1) ** 2)
+    splats = schedule.most * (4 * row + SPLAT_BYTES)
+    peak = BASE_BYTES + images + splats
+    sentence = (
+        f"{gib(peak)} at its peak: photographs at {len(schedule.factors)} sizes {gib(images)}, up to {schedule.most:,} splats "
+        f"{gib(splats)}, the program {gib(BASE_BYTES)}"
+    )
+    free = available_memory()
+    if free is not None and peak > SHARE * free:
+        raise InputError(
+            f"training would need {sentence}, but {gib(free)} of memory are free; use a larger --downscale or fewer splats "
+            "(--set splats.max_splats=N)"
+        )
+    return sentence
 
 
 class OctreePlan:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 from nerfvol.starts.fog import thin_octree
 from nerfvol.training.memory import OctreePlan, splits_within
-from nerfvol.views import render_image
+from nerfvol.views import OctreeModel, render_image
 
 BEHIND = 2
 """Stream of random numbers of the colours behind photographs; TileBank has 0 and 1."""
@@ -117,12 +118,12 @@ class OctreeTrainer:
         """See Phase."""
         return self.plan.outgrown(self.octree) if self.plan else None
 
-    def take_octree(self) -> Octree:
+    def take_model(self, metadata: dict[str, Any]) -> OctreeModel:
         """The finished octree; tiles, moments and statistics are released."""
         octree = self.finish()
         vars(self).pop("octree")
         return_free_memory()
-        return octree
+        return OctreeModel(octree, metadata)
 
     # ------------------------------------------------------------------ the schedule
     @property

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.kernels.state import StepReport
+from nerfvol.models import Model
 
 
 class Phase(Protocol):
@@ -59,6 +60,10 @@ class Phase(Protocol):
 
     def outgrown(self) -> str | None:
         """A sentence where the representation needs more memory than was announced."""
+        ...
+
+    def take_model(self, metadata: dict[str, Any]) -> Model:
+        """The finished model; everything else is released."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

@@ -114,6 +114,11 @@ class Run:
         self.phase, self.steps[phase.name] = phase.name, phase.steps_done
         self.saved = {"phase": "entered", "log_bytes": self.saved["log_bytes"]}  # releases the old arrays
 
+    def seconds_left(self) -> float | None:
+        """Of a time budget, before writing and scoring; None: there is none."""
+        budget = self.config.time_budget
+        return None if budget is None else max(0.0, budget - self._reserve - self.clock.elapsed())
+
     def phase_seconds(self) -> float:
         return self.clock.elapsed() - self.phase_started
 

@@ -20,7 +20,9 @@ from typing import Any
 from tqdm import tqdm
 
 from nerfvol import __version__
-from nerfvol.config.training import Config
+from nerfvol.config.training import OCTREE_STARTS, Config
+from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
 from nerfvol.files.checkpoint import save_checkpoint
@@ -29,13 +31,19 @@ from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_mem
 from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
-from nerfvol.training.memory import OctreePlan
+from nerfvol.training.memory import OctreePlan, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import check_folder, load_data
 from nerfvol.training.session import Clock, Run, Say, read_saved
+from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
+PRODUCT = {"octree": run_folder.OCTREE, "splats": run_folder.SPLATS}
+WHY = {
+    "octree": "an object on a transparent background, or asked for by --init",
+    "splats": "photographs, which splats draw sharper and sooner",
+}
 LOG_EVERY = 50
 """Steps between two lines of the log."""
 
@@ -78,20 +86,49 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
     clock = Clock(started, saved["elapsed"] if saved else 0.0)
     data = load_data(config, say)
     run = Run(config, data, clock, saved, say)
-    config = run.config
-    plan = OctreePlan(config, data.training, data.held_out_bytes)
-    lens = data.training.cameras[0].intrinsics
-    say(f"{len(data.training)} training views of {lens.width}x{lens.height}, {len(data.held_out)} held out; "
-        f"memory: {plan.sentence()}")  # fmt: skip
     with run.interruptible(), run:
-        from_field = config.init == "mlp" and run.phase in ("start", "field")
-        octree = start_from_field(run) if from_field else None
-        trainer = OctreeTrainer(data.training, config.background, config.octree, config.seed, octree, plan)
-        del octree
-        optimise(run, trainer)
-        trained = [trainer.take_octree()]
-        del trainer
+        phase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
+        optimise(run, phase)
+        trained = [phase.take_model(run.metadata())]
+        del phase
         return finish(run, trained)
+
+
+# ------------------------------------------------------------------ what is trained
+def begin_octree(run: Run) -> OctreeTrainer:
+    """The trainer of an octree: from low density, or from a field that is trained first and distilled."""
+    config, data = run.config, run.data
+    if config.init not in ("auto", *OCTREE_STARTS):
+        raise InputError(f"--init: an octree starts from {' or '.join(OCTREE_STARTS)}, got {config.init!r}")
+    plan = OctreePlan(config, data.training, data.held_out_bytes)
+    announce(run, plan.sentence())
+    octree = start_from_field(run) if config.init == "mlp" and run.phase in ("start", "field") else None
+    return OctreeTrainer(data.training, config.background, config.octree, config.seed, octree, plan)
+
+
+def begin_splats(run: Run) -> SplatTrainer:
+    """The trainer of splats: from what suits the data, or what ``init`` asks for."""
+    from nerfvol.training.splat_start import make_schedule_of, start_splats
+
+    config, dataset = run.config, run.data.training
+    photographs = Photographs(dataset, config.background)
+    for message in photographs.messages:
+        run.say(message)
+    schedule = make_schedule_of(run, photographs)
+    announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
+    splats, distance = start_splats(run, photographs)
+    return SplatTrainer(photographs, splats, config.splats, schedule, distance, config.background, config.seed)
+
+
+def announce(run: Run, memory: str) -> None:
+    """What is trained on what, and the memory that takes."""
+    lens = run.data.training.cameras[0].intrinsics
+    why = (
+        "" if run.given.representation != "auto" else f" ({WHY[run.config.representation]}; --representation overrules)"
+    )
+    run.say(f"training {run.config.representation}{why}")
+    run.say(f"{len(run.data.training)} training views of {lens.width}x{lens.height}, {len(run.data.held_out)} held out; "
+            f"memory: {memory}")  # fmt: skip
 
 
 # ------------------------------------------------------------------ the loop
@@ -154,11 +191,12 @@ def start_from_field(run: Run) -> Octree:
     return octree
 
 
-def finish(run: Run, trained: list[Octree]) -> Results:
+def finish(run: Run, trained: list[Model]) -> Results:
     """Writes the model, scores what was written, writes the scores. ``trained`` is emptied: its memory is needed."""
     run.claim(None)
-    config, path, seconds = run.config, run.folder / run_folder.OCTREE, run.phase_seconds()
-    written = OctreeModel(trained.pop(), run.metadata()).save(path, config.storage)
+    config, seconds = run.config, run.phase_seconds()
+    path = run.folder / PRODUCT[config.representation]
+    written = trained.pop().save(path, config.storage)
     return_free_memory()
     model = load_model(path)
     scores = evaluate(model, run.data.held_out, config.background)
@@ -187,7 +225,7 @@ def finish(run: Run, trained: list[Octree]) -> Results:
 def _counts(model: Model) -> dict[str, int]:
     """What the model is made of, by name."""
     described = model.describe()
-    return {name: described[name] for name in ("leaves", "vertices") if name in described}
+    return {name: described[name] for name in ("leaves", "vertices", "splats") if name in described}
 
 
 def progress_bar(name: str, done: float) -> tqdm[Any]:

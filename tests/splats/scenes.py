@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerfvol.cameras import look_at
+from nerfvol.cameras.camera import look_at
 from nerfvol.kernels import splat_ops
 from nerfvol.kernels.splat_state import SplatView
-from nerfvol.splats import Splats
+from nerfvol.splats.splats import Splats
 
 BACKGROUND = (1.0, 0.5, 0.2)
 ORIGIN = np.array([3.0, 1.0, 2.0])

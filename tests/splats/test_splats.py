@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Camera, Intrinsics, look_at
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.errors import InputError
 from nerfvol.kernels import splat_ops
-from nerfvol.kernels.splat_ops import SplatState
-from nerfvol.splats import Splats, concatenate, packing
-from nerfvol.splats.splats import rotations
+from nerfvol.kernels.splat_state import SplatState
+from nerfvol.splats import packing
+from nerfvol.splats.splats import Splats, concatenate, rotations
 from tests.splats.scenes import ORIGIN, random_image, random_splats, view_of_cube
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh")

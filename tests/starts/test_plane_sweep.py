@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Camera, Intrinsics, look_at
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.starts import plane_sweep as sweep
 from nerfvol.starts import sweep_reference
 from nerfvol.starts.plane_sweep import SweepView, depth_maps, neighbours_of, plane_sweep, sweep_factor

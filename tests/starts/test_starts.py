@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Camera, Intrinsics, look_at
-from nerfvol.datasets import load_dataset
-from nerfvol.datasets.dataset import Dataset, SceneBounds
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.load import load_dataset
+from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 from nerfvol.splats import neighbours
 from nerfvol.splats.neighbours import nearest
 from nerfvol.splats.points import PointCloud
@@ -17,7 +19,6 @@ from nerfvol.starts.cloud import LARGEST_SHARE, NEAREST_SHARE, camera_distance, 
 from nerfvol.starts.model_points import model_points
 from nerfvol.starts.random import random_points
 from nerfvol.starts.subject import subject_of
-from nerfvol.training.photographs import Photographs
 from tests.datasets import scenes
 
 LENS = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)

@@ -10,7 +10,7 @@ import pytest
 
 from nerfvol.cli.command import set_threads
 from nerfvol.config.training import FieldConfig
-from nerfvol.datasets import load_dataset
+from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
 from nerfvol.training import field_trainer, octree_trainer, prepare, session

@@ -5,12 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from nerfvol.cameras import Camera, Intrinsics, look_at
-from nerfvol.datasets.dataset import Dataset, SceneBounds
+from nerfvol.cameras import warp
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
+from nerfvol.cameras.canvas import canvas_of, is_pinhole, source_grid
+from nerfvol.cameras.through_lens import through_lens
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.photographs import FACTORS, Photographs, estimate_bytes, level_camera, undistorted
 from nerfvol.errors import InputError
-from nerfvol.training import warp
-from nerfvol.training.canvas import canvas_of, is_pinhole, source_grid
-from nerfvol.training.photographs import FACTORS, Photographs, estimate_bytes, level_camera, through_lens, undistorted
+from nerfvol.region import SceneBounds
 
 PINHOLE = Intrinsics(90, 70, 80.0, 82.0, 44.0, 36.0)
 BARREL = Intrinsics(120, 90, 100.0, 98.0, 61.0, 44.0, k1=-0.2, k2=0.05, p1=0.003, p2=-0.002)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras import Intrinsics
+from nerfvol.cameras.camera import Intrinsics
 from nerfvol.errors import InputError
 
 Float = NDArray[np.float64]

@@ -1,0 +1,83 @@
+"""How many Gaussians, at which size of the photographs and when: what the seconds of a run can pay for.
+
+Measured on two cores (docs/performance.md): small sizes first, for a step at an eighth of the size costs a twentieth and
+teaches the same; growth early, for a Gaussian must still be optimised; and no more of them than the seconds can optimise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+SECONDS_PER_STEP = 1 / 80
+"""Of a run without a time budget: what its steps would take on two cores, for the tables below."""
+COARSEST_SIDE = 100
+"""Pixels along the longer side, at least, of the smallest photographs trained on."""
+PIXELS_PER_SPLAT = 8
+"""Of all training images together: more Gaussians than that have nothing to learn from."""
+
+_SECONDS = (8.0, 15.0, 30.0, 60.0, 120.0, 270.0, 600.0, 1800.0)
+_ENDS = {  # share of progress at which 1/8, 1/4 and 1/2 of the size end
+    8: (0.10, 0.08, 0.06, 0.04, 0.02, 0.015, 0.008, 0.004),
+    4: (0.40, 0.35, 0.25, 0.20, 0.12, 0.07, 0.04, 0.02),
+    2: (0.85, 0.80, 0.70, 0.60, 0.45, 0.33, 0.25, 0.20),
+}
+_GROWN = (0.60, 0.60, 0.50, 0.50, 0.35, 0.30, 0.20, 0.15)
+_PHOTOGRAPHS = (25e3, 35e3, 50e3, 80e3, 130e3, 180e3, 220e3, 300e3)
+_OBJECTS = (35e3, 50e3, 75e3, 105e3, 155e3, 172e3, 200e3, 250e3)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """factors: of the photographs' reduction, one a stage, the last 1. ends: progress at which each stage ends. most: Gaussians
+    at the end of growth, which lasts from ``GROWTH_STARTS`` to ``grown``."""
+
+    factors: tuple[int, ...]
+    ends: tuple[float, ...]
+    most: int
+    grown: float
+
+    def stage(self, progress: float) -> int:
+        """The stage of ``progress`` in [0, 1]."""
+        return sum(progress >= end for end in self.ends[:-1])
+
+    def planned(self, start: int, progress: float) -> int:
+        """Gaussians that there should be at ``progress`` where ``start`` were there first: exponential growth."""
+        share = min(1.0, max(0.0, (progress - GROWTH_STARTS) / (self.grown - GROWTH_STARTS)))
+        return int(start * (max(self.most, start) / start) ** share)
+
+
+GROWTH_STARTS = 0.03
+"""Share of progress."""
+
+
+def make_schedule(
+    seconds: float, sizes: Sequence[tuple[int, int]], photographs: bool, most: int | None = None
+) -> Schedule:
+    """The schedule of ``seconds`` of training on views of ``sizes`` (width, height).
+
+    most: Gaussians at the end; None: as many as the seconds can optimise.
+    """
+    longest = max(max(size) for size in sizes)
+    coarsest = 1
+    while longest / (2 * coarsest) >= COARSEST_SIDE and coarsest < 64:
+        coarsest *= 2
+    factors = tuple(2**k for k in range(int(math.log2(coarsest)), -1, -1))
+    ends = []
+    for factor in factors[:-1]:
+        end = _at(_ENDS[min(factor, 8)], seconds)
+        ends.append(end * (8 / factor) ** 2 if factor > 8 else end)
+    pixels = sum(width * height for width, height in sizes)
+    affordable = int(_at(_PHOTOGRAPHS if photographs else _OBJECTS, seconds))
+    wanted = most if most is not None else min(affordable, max(1000, pixels // PIXELS_PER_SPLAT))
+    return Schedule(factors, (*ends, 1.0), wanted, _at(_GROWN, seconds))
+
+
+def _at(values: Sequence[float], seconds: float) -> float:
+    """Interpolated over the logarithm of the seconds; constant beyond the table."""
+    x = math.log(min(max(seconds, _SECONDS[0]), _SECONDS[-1]))
+    at = [math.log(s) for s in _SECONDS]
+    k = max(i for i in range(len(at) - 1) if at[i] <= x)
+    share = (x - at[k]) / (at[k + 1] - at[k])
+    return values[k] + share * (values[k + 1] - values[k])

@@ -1,0 +1,61 @@
+"""What the splats of a run begin with, and the schedule that its seconds allow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
+from nerfvol.kernels.splat_state import SplatState
+from nerfvol.splats.splats import Splats
+from nerfvol.starts.choose import STARTS, choose_start
+from nerfvol.starts.cloud import splats_of_cloud
+from nerfvol.starts.subject import subject_of
+from nerfvol.training.session import Run
+from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule
+
+OBJECT_OPACITY = 0.3
+"""Random points are mostly nowhere: they begin fainter than points that were found."""
+
+
+def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
+    """The schedule of the seconds that the run has left, or of its steps."""
+    config = run.config
+    left = run.seconds_left()
+    seconds = config.splats.steps * SECONDS_PER_STEP if left is None else left
+    sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
+    return make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
+
+
+def start_splats(run: Run, photographs: Photographs) -> tuple[Splats, float]:
+    """The splats to begin with, and the median camera's distance to the subject, scene units.
+
+    Raises:
+        InputError: the start that ``init`` names is unknown or finds nothing.
+    """
+    config, dataset = run.config, run.data.training
+    degree = config.splats.sh_degree or 0
+    if run.phase == "splats":  # the checkpoint has them
+        saved = run.saved["trainer"]
+        return SplatState.from_arrays(saved).splats(), float(saved["subject_distance"])
+    if config.init not in ("auto", *STARTS):
+        return _from_file(run, config.init, degree), subject_of(dataset).distance
+    start = choose_start(dataset, photographs, None if config.init == "auto" else config.init, config.seed)
+    run.say(start.sentence)
+    opacity = OBJECT_OPACITY if start.name == "random" else 0.5
+    distance = start.subject.distance
+    return splats_of_cloud(start.cloud, photographs.cameras, distance, degree, config.splats.mode, opacity), distance
+
+
+def _from_file(run: Run, path: str, degree: int) -> Splats:
+    """The splats of a file or run folder."""
+    from nerfvol.models import load_model
+    from nerfvol.views import SplatModel
+
+    if not Path(path).exists():
+        raise InputError(f"--init: splats start from {', '.join(STARTS)} or a file of splats, got {path!r}")
+    model = load_model(path)
+    if not isinstance(model, SplatModel):
+        raise InputError(f"--init {path}: expected splats, it is a model of {model.kind}")
+    run.say(f"start: the {model.packed.n:,} splats of {path}")
+    return model.splats.with_sh_degree(degree)

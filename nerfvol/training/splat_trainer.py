@@ -1,0 +1,188 @@
+"""Optimising Gaussian splats: small photographs first, one whole view a step, splitting where the error is, pruning.
+
+Sources: 3D Gaussian splatting, Kerbl et al. 2023; the anti-aliased opacity of Mip-Splatting, Yu et al. 2024; splitting by error
+to a planned number, as in Taming 3DGS, Mallick et al. 2024. The rates are our own: a run on a CPU has thousands of steps
+where theirs has tens of thousands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from nerfvol.cameras.camera import Camera
+from nerfvol.config.splats import SplatConfig
+from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
+from nerfvol.kernels import splat_ops
+from nerfvol.kernels.splat_state import NEAR_SHARE, SplatOptions, SplatRates, SplatState, view_of
+from nerfvol.kernels.state import StepReport
+from nerfvol.splats.packing import LOGIT
+from nerfvol.splats.splats import Splats
+from nerfvol.training.splat_schedule import Schedule
+from nerfvol.views import SplatModel
+
+VIEWS, SPLITS = 3, 4
+"""Streams of random numbers; octree training has 0 to 2."""
+ERROR_KEPT = 0.3
+"""Of the sum of errors of a Gaussian after a round of splitting: what it was slow to learn counts again."""
+SECONDS_TO_WRITE = 0.3
+
+
+class SplatTrainer:
+    """Optimises splats on photographs; a phase (training.phase.Phase). ``progress`` runs from 0 to 1 and drives everything."""
+
+    name = "splats"
+    rates = "splats.rate_means, splats.rate_scales and splats.rate_logits"
+    previews = (0.03, 0.1, 0.3, 0.6, 1.0)
+    preview_width = 400
+    most_steps = math.inf
+
+    def __init__(
+        self,
+        photographs: Photographs,
+        splats: Splats,
+        config: SplatConfig,
+        schedule: Schedule,
+        subject_distance: float,
+        background: Sequence[float],
+        seed: int = 0,
+    ) -> None:
+        """``config`` with a number for each None; ``subject_distance``: the median camera's, scene units."""
+        self.photographs, self.config, self.schedule, self.seed = photographs, config, schedule, seed
+        self.background = (float(background[0]), float(background[1]), float(background[2]))
+        self.subject_distance = subject_distance
+        self.state = SplatState(splats)
+        self.started_with = self.state.n
+        self.steps = config.steps
+        self.steps_done, self.stage = 0, 0
+        self.seen_since = 0  # steps since what was not seen was last asked for
+
+    # ------------------------------------------------------------------ what a run asks of a phase
+    @property
+    def stages_left(self) -> int:
+        """See Phase."""
+        return len(self.schedule.factors) - 1 - self.stage
+
+    def share_of(self, seconds: float) -> float:
+        """All of the time left."""
+        return seconds
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """(H, W, 3) as the camera sees the splats."""
+        return SplatModel(self.state.packed, self.metadata()).render(camera, self.background)["rgb"]
+
+    def metadata(self) -> dict[str, Any]:
+        """What drawing needs beside the splats."""
+        return {"near": NEAR_SHARE * self.subject_distance}
+
+    def size(self) -> str:
+        """See Phase."""
+        return f"{self.state.n:,} splats"
+
+    def seconds_to_write(self) -> float:
+        """See Phase."""
+        return SECONDS_TO_WRITE
+
+    def needs_images(self) -> bool:
+        """The photographs hold them."""
+        return False
+
+    def outgrown(self) -> str | None:
+        """The number of splats is bounded before the start."""
+        return None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything an exact continuation needs."""
+        return {
+            **self.state.arrays(), "stage": self.stage, "steps_done": self.steps_done, "started_with": self.started_with,
+            "seen_since": self.seen_since, "factors": list(self.schedule.factors), "ends": list(self.schedule.ends),
+            "most": self.schedule.most, "grown": self.schedule.grown, "subject_distance": self.subject_distance,
+        }  # fmt: skip
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from :meth:`state_dict` as if nothing had happened."""
+        self.state = SplatState.from_arrays(state)
+        for name in ("stage", "steps_done", "started_with", "seen_since"):
+            setattr(self, name, int(state[name]))
+        factors, ends = tuple(int(f) for f in state["factors"]), tuple(float(e) for e in state["ends"])
+        self.schedule = Schedule(factors, ends, int(state["most"]), float(state["grown"]))
+        self.subject_distance = float(state["subject_distance"])
+
+    # ------------------------------------------------------------------ the schedule
+    def step(self, progress: float) -> StepReport:
+        """One view at ``progress`` in [0, 1] of the run."""
+        stage = self.schedule.stage(progress)
+        if stage != self.stage:
+            self.photographs.drop(self.schedule.factors[self.stage])
+            self.stage = stage
+        if self.steps_done and self.steps_done % self.config.grow_every == 0:
+            self.grow(progress)
+        view = self.photographs.view(self._next_view(), self.schedule.factors[self.stage])
+        near = NEAR_SHARE * self.subject_distance
+        report = splat_ops.train_step(
+            self.state,
+            view_of(view.camera, self.state.origin, near),
+            view.image,
+            self._options(),
+            self._rates(progress),
+        )
+        self.steps_done += 1
+        self.seen_since += 1
+        pixels = view.image.shape[0] * view.image.shape[1]
+        return StepReport(report.squared_error, 16 * report.blocks / pixels)
+
+    def _next_view(self) -> int:
+        """Seed-shuffled epochs."""
+        epoch, position = divmod(self.steps_done, len(self.photographs))
+        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, VIEWS, epoch])))
+        return int(random.permutation(len(self.photographs))[position])
+
+    def _options(self) -> SplatOptions:
+        c = self.config
+        scale = c.scale / self.subject_distance
+        return SplatOptions(self.background, ssim=c.ssim or 0.0, scale=scale, early_stop_eps=c.early_stop_eps)
+
+    def _rates(self, progress: float) -> SplatRates:
+        c = self.config
+        fade = (c.rate_decay or 1.0) ** progress
+        return SplatRates(
+            means=c.rate_means * (c.rate_decay_means or 1.0) ** progress, log_scales=c.rate_scales * fade,
+            quats=c.rate_quats * fade, logits=c.rate_logits * fade, dc=c.rate_dc * fade, sh=c.rate_sh * fade, beta2=c.beta2,
+        )  # fmt: skip
+
+    def grow(self, progress: float) -> None:
+        """Removes what is nearly transparent or in no photograph, and splits what holds the error, up to the plan."""
+        state = self.state
+        keep = state.row(LOGIT) > math.log(self.config.prune_opacity / (1 - self.config.prune_opacity))
+        if self.seen_since >= len(self.photographs):  # each photograph was asked
+            keep &= state.per_splat("seen") > 0
+            self.seen_since = 0
+            state.seen[...] = 0
+        if not keep.any():
+            raise InputError(
+                f"the splats collapsed to empty space at step {self.steps_done}: no photograph needs any of them; check "
+                "that the poses belong to the photographs, or choose another start (--init)"
+            )
+        if not keep.all():
+            state.prune(keep)
+        wanted = self.schedule.planned(self.started_with, progress) - state.n
+        error = state.per_splat("error").astype(np.float64) ** 0.7
+        candidates = np.flatnonzero(error > 0)
+        count = min(wanted, len(candidates))
+        if count > 0 and progress < self.schedule.grown:
+            random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, SPLITS, self.steps_done])))
+            # The largest of log(u) / p: a weighted draw without replacement (Efraimidis & Spirakis 2006).
+            keys = np.log(random.random(len(candidates))) / error[candidates]
+            state.split(candidates[np.argpartition(-keys, count - 1)[:count]])
+        state.error *= ERROR_KEPT
+        state.reorder()
+
+    def take_model(self, metadata: dict[str, Any]) -> SplatModel:
+        """The splats without those that are nearly transparent."""
+        splats = self.state.splats()
+        seen = 1 / (1 + np.exp(-splats.logits.astype(np.float64))) >= self.config.prune_opacity
+        return SplatModel(splats.select(seen) if seen.any() else splats, {**metadata, **self.metadata()})
