@@ -49,6 +49,7 @@ def check_background(background) -> list[float]:
 
 
 def check_outputs(outputs: Sequence[str]) -> None:
+    """ValueError unless every name is among state.OUTPUTS."""
     if unknown := set(outputs) - set(OUTPUTS):
         raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
 

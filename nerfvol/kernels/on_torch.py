@@ -72,6 +72,8 @@ def _render_leaves(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -
 
 
 class _Render(torch.autograd.Function):
+    """The compiled renderer and its adjoint, for autograd."""
+
     @staticmethod
     def forward(ctx, values, octree, o, d, bg, eps):
         compiled = native()
@@ -104,7 +106,8 @@ def render_values(
     """Differentiable rendering with vertex rows ``values`` (n_vertices, row) in place of the octree's own.
 
     Returns rgb (n, 3), transmittance (n,), expected distance (n,); gradients flow to ``values``. float64 values run on
-    the reference, float32 on the compiled kernels where they exist.
+    the reference, float32 on the compiled kernels where they exist. Raises ValueError as ops.render_rays does, and where
+    the values do not have the octree's shape.
     """
     if values.shape != octree.values.shape:
         raise ValueError(f"values must have the octree's shape {octree.values.shape}, got {tuple(values.shape)}")
@@ -118,7 +121,10 @@ def render_values(
 
 
 def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOptions) -> Tensor:
-    """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled."""
+    """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled.
+
+    Raises ValueError where the batch's parts or the values do not fit.
+    """
     o, d, _, _ = check_batch(batch, options)
     if values.dtype == torch.float32 and (compiled := native()) is not None:
         gradient = torch.zeros_like(values)

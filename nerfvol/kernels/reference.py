@@ -89,6 +89,7 @@ class Samples:
 
     @property
     def middle(self) -> Tensor:
+        """Distance of each midpoint from its ray's origin, scene units: (n_segments,)."""
         return (self.segments.t_near + self.segments.t_far) / 2
 
 
@@ -98,7 +99,10 @@ def explin(raw: Tensor) -> Tensor:
 
 
 def sample(octree: Octree, values: Tensor, rays_o: Tensor, rays_d: Tensor, early_stop_eps: float = 0.0) -> Samples:
-    """The field along rays and its weights. values: (n_vertices, row) in the rays' dtype, may require a gradient."""
+    """The field along rays (n, 3) and its weights, one midpoint a segment [Max 95].
+
+    values: (n_vertices, row) in the rays' dtype, may require a gradient; early_stop_eps as in ops.render_rays.
+    """
     with torch.no_grad():
         seg = intersect(octree, rays_o, rays_d)
         level, ijk = torch.from_numpy(octree.leaf_level), torch.from_numpy(octree.leaf_ijk)

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <memory>
 #include <new>
+#include <utility>
 
 #include "render.h"
 
@@ -70,19 +71,19 @@ public:
         while ((size_t(1) << bits_) <= n) ++bits_;
         entries_.assign(size_t(1) << bits_, {-1, 0});
     }
-    template <int B> void add(int32_t vertex, const f16 (&gradient)[B], VertexGradients& gradients) {
+    template <int B> void add(int32_t vertex, const float (&gradient)[16 * B], VertexGradients& gradients) {
         const size_t mask = entries_.size() - 1;
         for (size_t at = (uint32_t(vertex) * 2654435769u) >> (32 - bits_);; at = (at + 1) & mask) {
             Entry& e = entries_[at];
             if (e.vertex == vertex) {
                 float* row = gradients.row(size_t(e.place));
-                for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(row + 16 * k) + gradient[k]);
+                for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(row + 16 * k) + load<f16>(gradient + 16 * k));
                 return;
             }
             if (e.vertex >= 0) continue;
             e = {vertex, int32_t(gradients.vertices.size())};
             float* row = gradients.append(vertex);
-            for (int k = 0; k < B; ++k) store(row + 16 * k, gradient[k]);
+            for (int k = 0; k < B; ++k) store(row + 16 * k, load<f16>(gradient + 16 * k));
             return;
         }
     }
@@ -196,30 +197,114 @@ inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t f
     }
 }
 
-// Differences below these count by their squares, larger ones as they are: an edge of the scene is no worse than a slope.
-constexpr float kKneeDensity = 1.0f, kKneeSh = 0.1f;
+// Calls f(0), ..., f(7) with numbers known at once. GCC unrolls loops after it has decided which arrays become registers: one
+// with an index that was a loop's stays in memory, and is cleared and copied there in pieces of 16 bytes.
+template <class F, int... O> inline void each_of(std::integer_sequence<int, O...>, F&& f) { (f(std::integral_constant<int, O>{}), ...); }
+template <class F> inline void each_corner(F&& f) { each_of(std::make_integer_sequence<int, 8>{}, f); }
+
+// The gradient of a vertex row at each of a leaf's eight corners.
+template <int B> struct CornerRows {
+    alignas(64) float row[8][16 * B];
+};
+
+// Of the numbers of a row's first block and of a further one: what weighs their differences, and the knee e below which these
+// count by their squares, larger ones as they are: an edge of the scene is no worse than a slope.
+struct Variation {
+    alignas(64) float of_sh[32], of_density[32], knee[32];
+
+    constexpr Variation() : of_sh(), of_density(), knee() {
+        for (int i = 0; i < 32; ++i) {
+            const bool is_sh = i < kDensitySlot || i >= 16;
+            of_sh[i] = is_sh ? 1.0f : 0.0f;
+            of_density[i] = i == kDensitySlot ? 1.0f : 0.0f;
+            knee[i] = is_sh ? 0.1f : 1.0f;
+        }
+    }
+};
+constexpr Variation kVariation;
+
+// One axis's share of add_variation: the four edges along it.
+template <int Axis> void differences_along(const fwide (&value)[8], fwide weight, fwide knee, fwide (&sum)[8]) {
+    each_corner([&](auto o) {
+        if constexpr ((o & Axis) != 0) {
+            const fwide d = value[o] - value[o ^ Axis], slope = weight * d / (knee + vmax(d, -d));
+            sum[o] += slope;
+            sum[o ^ Axis] -= slope;
+        }
+    });
+}
 
 // Adds to the gradients of a leaf's corners that of their differences d along its edges, the sum of weight * (|d| - e log(1 +
 // |d| / e)) over edges and numbers of a vertex row: a total variation [Plenoxels] that is smooth at zero.
-template <int B> void add_variation(const Tree& tree, const int32_t* corners, float density, float colour, f16 (&gradient)[8][B]) {
-    const f4 rgb = {colour, colour, colour, colour}, knee = {kKneeSh, kKneeSh, kKneeSh, kKneeSh};
-    const f4 raw = {kKneeDensity, kKneeDensity, kKneeDensity, kKneeDensity};
-    for (int k = 0; k < B; ++k) {
-        const f16 weight = k == 0 ? join(rgb, rgb, rgb, f4{density, 0, 0, 0}) : splat16(colour);
-        const f16 e = k == 0 ? join(knee, knee, knee, raw) : splat16(kKneeSh);
-        f16 value[8];
-        for (int o = 0; o < 8; ++o) value[o] = load<f16>(tree.values + 16 * (B * int64_t(corners[o]) + k));
-        for (int axis = 1; axis < 8; axis *= 2)
-            for (int o = 0; o < 8; ++o)
-                if (o & axis) {
-                    const f16 d = value[o] - value[o ^ axis], slope = weight * d / (e + vmax(d, -d));
-                    gradient[o][k] += slope;
-                    gradient[o ^ axis][k] -= slope;
-                }
+template <int B> void add_variation(const Tree& tree, const int32_t* corners, float density, float sh, CornerRows<B>& gradient) {
+    for (int at = 0; at < 16 * B; at += kWide) {
+        const int k = at < 16 ? at : 16 + at % 16;
+        const fwide w = sh * load<fwide>(kVariation.of_sh + k) + density * load<fwide>(kVariation.of_density + k);
+        const fwide e = load<fwide>(kVariation.knee + k);
+        fwide value[8], sum[8];
+        each_corner([&](auto o) {
+            value[o] = load<fwide>(tree.values + 16 * B * int64_t(corners[o]) + at);
+            sum[o] = load<fwide>(gradient.row[o] + at);
+        });
+        differences_along<1>(value, w, e, sum);
+        differences_along<2>(value, w, e, sum);
+        differences_along<4>(value, w, e, sum);
+        each_corner([&](auto o) { store(gradient.row[o] + at, sum[o]); });
     }
 }
 
-// Back to front: dL/d(r, g, b, raw density) of each hit, added to the rows of its leaf's corners.
+// dL/d(r, g, b, raw density) of one hit over the numbers of a vertex row, and its shares of the leaf's corners.
+template <int B> struct Pull {
+    static constexpr int kRow = B == 2 ? 32 : 16;  // degree 2's second block is not spread like the first
+    alignas(64) float gradient[kRow];
+    alignas(32) float share[8];
+    const float* basis;
+};
+
+// Sums over a leaf's hits for its corners, one register of the row at a time: the eight sums stay in registers.
+template <int B> void sum_pulls(const Pull<B>* pulls, int n, CornerRows<B>& to) {
+    for (int at = 0; at < 16 * B; at += kWide) {
+        fwide sum[8];
+        each_corner([&](auto o) { sum[o] = splat<fwide>(0.0f); });
+        for (int i = 0; i < n; ++i) {
+            const Pull<B>& p = pulls[i];
+            const fwide g = load<fwide>(p.gradient + at % Pull<B>::kRow) * load<fwide>(p.basis + at);
+            each_corner([&](auto o) { sum[o] += p.share[o] * g; });
+        }
+        each_corner([&](auto o) { store(to.row[o] + at, sum[o]); });
+    }
+}
+
+// dL/d(r, g, b, raw density) of one hit; all hits of its ray behind it come first.
+inline f4 gradient_of_hit(const Hit& h, Adjoint& a, float per_length) {
+    const int l = h.lane;
+    const float w = h.weight;
+    f4 c = h.value + 0.5f;
+    c[3] = h.middle;
+    const f4 product = a.colour[l] * c;
+    float q = product[0] + product[1] + product[2] + product[3];
+    f4 gradient = w * a.colour[l];
+    if (a.colour_weight[l] > 0) {
+        f4 away = {c[0] - a.target[l][0], c[1] - a.target[l][1], c[2] - a.target[l][2], 0};
+        const f4 square = away * away;
+        q += a.colour_weight[l] * (square[0] + square[1] + square[2]);
+        gradient += 2 * a.colour_weight[l] * w * away;
+    }
+    if (a.distortion_weight[l] > 0) {
+        const float m = h.middle;
+        const float w_behind = a.weight_behind[l], m_behind = a.moment_behind[l];
+        const float w_front = a.weight_sum[l] - w_behind - w, m_front = a.moment_sum[l] - m_behind - w * m;
+        q += a.distortion_weight[l] * (2 * (m * (w_front - w_behind) - (m_front - m_behind)) +
+                                       (2.0f / 3.0f) * w * h.length * per_length);
+        a.weight_behind[l] = w_behind + w;
+        a.moment_behind[l] = m_behind + w * m;
+    }
+    gradient[3] = (h.trans_after * q - a.behind[l]) * h.tau_slope;
+    a.behind[l] += w * q;
+    return gradient;
+}
+
+// Back to front: the hits' gradients, added to the rows of their leaf's corners.
 template <int B>
 void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& work, Adjoint& a, VertexTable& table,
                      VertexGradients& gradients) {
@@ -228,54 +313,30 @@ void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& wor
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
     gradients.start(8 * work.visits.size(), 16 * B);
     table.start(8 * work.visits.size());
+    Pull<B> pulls[kTile];
+    CornerRows<B> rows;
     for (size_t v = work.visits.size(); v-- > 0;) {
         Visit& visit = work.visits[v];
-        const Hit* h = work.hits.get() + work.first_hit[v];
-        f16 corner[8][B] = {};
+        const Hit* hits = work.hits.get() + work.first_hit[v];
         float crossed = 0;                   // ways of the rays through the leaf, by their weights
         for (int i = 0; i < visit.n_hits; ++i) {
-            const int l = h[i].lane;
-            const float w = h[i].weight;
-            f4 c = h[i].value + 0.5f;
-            c[3] = h[i].middle;
-            const f4 product = a.colour[l] * c;
-            float q = product[0] + product[1] + product[2] + product[3];
-            f4 gradient = w * a.colour[l];
-            if (a.colour_weight[l] > 0) {
-                f4 away = {c[0] - a.target[l][0], c[1] - a.target[l][1], c[2] - a.target[l][2], 0};
-                const f4 square = away * away;
-                q += a.colour_weight[l] * (square[0] + square[1] + square[2]);
-                gradient += 2 * a.colour_weight[l] * w * away;
-            }
-            if (a.distortion_weight[l] > 0) {
-                const float m = h[i].middle;
-                const float w_behind = a.weight_behind[l], m_behind = a.moment_behind[l];
-                const float w_front = a.weight_sum[l] - w_behind - w, m_front = a.moment_sum[l] - m_behind - w * m;
-                q += a.distortion_weight[l] * (2 * (m * (w_front - w_behind) - (m_front - m_behind)) +
-                                               (2.0f / 3.0f) * w * h[i].length * per_length);
-                a.weight_behind[l] = w_behind + w;
-                a.moment_behind[l] = m_behind + w * m;
-            }
-            gradient[3] = (h[i].trans_after * q - a.behind[l]) * h[i].tau_slope;
-            a.behind[l] += w * q;
-            visit.error += w * a.error[l];
-            crossed += a.ray_weight[l] * h[i].length;
-
-            alignas(32) float share[8];
-            store(share, trilinear(h[i].fx, h[i].fy, h[i].fz));
-            keep_in_memory(share);
-            const f16 g = spread(gradient);
-            for (int k = 0; k < B; ++k) {
-                const f16 gk = (B == 2 && k == 1 ? spread_three(gradient) : g) * load<f16>(basis.row[l] + 16 * k);
-                for (int o = 0; o < 8; ++o) corner[o][k] += share[o] * gk;
-            }
+            const Hit& h = hits[i];
+            const f4 gradient = gradient_of_hit(h, a, per_length);
+            visit.error += h.weight * a.error[h.lane];
+            crossed += a.ray_weight[h.lane] * h.length;
+            Pull<B>& p = pulls[i];
+            store(p.share, trilinear(h.fx, h.fy, h.fz));
+            store(p.gradient, spread(gradient));
+            if (B == 2) store(p.gradient + Pull<B>::kRow - 16, spread_three(gradient));
+            p.basis = basis.row[h.lane];
         }
+        sum_pulls<B>(pulls, visit.n_hits, rows);
         const int32_t* corners = tree.corners + 8 * int64_t(visit.leaf);
         if (with_variation) {
             const float sides = crossed * per_length / visit.side;
-            add_variation<B>(tree, corners, a.tv_density * sides, a.tv_sh * sides, corner);
+            add_variation<B>(tree, corners, a.tv_density * sides, a.tv_sh * sides, rows);
         }
-        for (int o = 0; o < 8; ++o) table.add(corners[o], corner[o], gradients);
+        for (int o = 0; o < 8; ++o) table.add<B>(corners[o], rows.row[o], gradients);
     }
 }
 

@@ -45,6 +45,16 @@ typedef Pair<f8> f16;
 typedef Pair<Pair<f4>> f16;
 #endif
 
+// The widest vector that is one register.
+#if defined(__AVX512F__)
+typedef f16 fwide;
+#elif defined(__AVX__)
+typedef f8 fwide;
+#else
+typedef f4 fwide;
+#endif
+constexpr int kWide = sizeof(fwide) / sizeof(float);
+
 inline f4 splat4(float x) { return f4{x, x, x, x}; }
 inline f8 splat8(float x) { return f8{x, x, x, x, x, x, x, x}; }
 inline void splat(float x, f4& v) { v = splat4(x); }
@@ -160,18 +170,25 @@ template <int I> inline f4 quarter(const f16& v) {
 inline f16 join(f4 a, f4 b, f4 c, f4 d) { return {{a, b}, {c, d}}; }
 #endif
 
+#if defined(__AVX512F__)
+// As __builtin_shufflevector GCC writes v to the stack and reads 64 bytes back, which waits for the store.
+inline f16 spread_by(f4 v, __m512i places) {
+    return (f16)_mm512_maskz_permutexvar_ps(0xffff, places, _mm512_castps128_ps512((__m128)v));
+}
+#endif
+
 // Each of v's numbers four times: a colour and a raw density over a vertex row. spread_three has v itself in the last quarter,
 // where the second block of degree 2 keeps one coefficient of each channel.
 inline f16 spread(f4 v) {
 #if defined(__AVX512F__)
-    return __builtin_shufflevector(v, v, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+    return spread_by(v, _mm512_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3));
 #else
     return join(splat4(v[0]), splat4(v[1]), splat4(v[2]), splat4(v[3]));
 #endif
 }
 inline f16 spread_three(f4 v) {
 #if defined(__AVX512F__)
-    return __builtin_shufflevector(v, v, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 3);
+    return spread_by(v, _mm512_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 3));
 #else
     return join(splat4(v[0]), splat4(v[1]), splat4(v[2]), v);
 #endif
