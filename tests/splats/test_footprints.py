@@ -92,8 +92,8 @@ def brute_force(splats, view):
 
 @functools.cache
 def many_ellipses():
-    """1,500 ellipses, a view whose rows and columns fill no tile, and the truth by brute force."""
-    splats, view = ellipses(1500, 1), straight_view(152, 104, FOCAL)
+    """700 ellipses, a view whose rows and columns fill no tile, and the truth by brute force."""
+    splats, view = ellipses(700, 1), straight_view(152, 104, FOCAL)
     with torch.no_grad():
         return splats, view, *brute_force(splats, view)
 
