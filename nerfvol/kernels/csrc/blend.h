@@ -2,8 +2,6 @@
 //
 // w = T alpha, C += w c, T -= w; a pixel ends with the Gaussian at which T falls below early_stop_eps.
 #pragma once
-#include <cmath>
-
 #include "splat_order.h"
 
 namespace NERFVOL_ISA {

@@ -3,6 +3,9 @@
 // In rows dy from the mean, the ellipse alpha >= 1/255 reaches from k dy - h(dy) to k dy + h(dy), h^2 = w (1 - dy^2 / half_height^2).
 // Its right edge is farthest at dy = tip, its left edge at -tip, so that a band's extremes are at the tips clamped to the band.
 #pragma once
+#include <algorithm>
+#include <cmath>
+
 #include "splat_project.h"
 
 namespace NERFVOL_ISA {
@@ -50,7 +53,7 @@ template <class Count> int32_t list_tiles(const Record& g, const TileGrid& grid,
     int32_t n = 0;
     const float margin = 1e-2f;
     const int32_t top = int32_t(std::max(g.y - g.half_height - 0.5f - margin, 0.0f)) / 16;
-    const int32_t bottom = std::min(int32_t(std::max(g.y + g.half_height + margin, 0.0f)) / 16, grid.rows - 1);
+    const int32_t bottom = int32_t(std::clamp(g.y + g.half_height + margin, 0.0f, 16.0f * float(grid.rows) - 1)) / 16;
     const BandEdges edges(g);
     const f16 first_pixel = load<f16>(kBlockX) + 0.5f;
     for (int32_t row = top; row <= bottom; ++row) {
