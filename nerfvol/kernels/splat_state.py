@@ -236,6 +236,18 @@ class SplatState:
             self.first[block, :, lane] = 0
             self.second[block, :, lane] *= 0.5
 
+    def grow(self, count: int, rng: np.random.Generator, power: float = 0.7, fade: float = 0.3) -> int:
+        """Splits ``count`` splats drawn with probability ~ error^power, or all that have an error; returns how many.
+
+        Afterwards the errors are multiplied by ``fade``, so that a round of growth still knows a little of what went before.
+        """
+        chance = self.per_splat("error").astype(np.float64).clip(0) ** power
+        count = min(count, int(np.count_nonzero(chance)))
+        if count > 0:
+            self.split(rng.choice(self.n, count, replace=False, p=chance / chance.sum()))
+        self.error *= np.float32(fade)
+        return max(count, 0)
+
     def reorder(self, middle: ArrayLike | None = None, size: float | None = None) -> None:
         """Sorts the splats along a Morton curve through space, contracted outside a box about ``middle`` (3,) of half side
         ``size`` (relative to the origin, scene units); without them the box holds the middle 80 % of the means on each axis."""

@@ -80,7 +80,7 @@ def test_depths_from_near_to_sixteen_octaves_are_told_apart(isa):
 @functools.cache
 def crowd():
     """10^5 splats, a view, and the twin's picture."""
-    splats, view = random_splats(100_000, 1, 3, size=0.01), straight_view(32, 32)
+    splats, view = random_splats(100_000, 1, 3, size=0.01), straight_view(32, 16)
     splats.means[:, 2] += 3
     splats.logits -= 2
     with torch.no_grad():

@@ -142,6 +142,17 @@ def test_split():
             assert np.array_equal(packing.from_blocks(state.second, 53)[k], second[old] / 2)
 
 
+def test_grow_draws_by_error():
+    state = trained_state()
+    state.per_splat("error")[:] = 0
+    state.per_splat("error")[[5, 9, 30]] = (1.0, 2.0, 3.0)
+    assert state.grow(2, np.random.default_rng(0)) == 2 and state.n == 52
+    assert state.grow(20, np.random.default_rng(0)) == 5 and state.n == 57  # two pairs and the one that was left
+    assert state.per_splat("error").max() == pytest.approx(3 * 0.3**2)
+    state.per_splat("error")[:] = 0
+    assert state.grow(3, np.random.default_rng(0)) == 0 and state.n == 57
+
+
 def test_reorder_is_along_a_morton_curve():
     state = SplatState(random_splats(4000, 1, 9))
     state.params[0, :3, 0] = 1e6  # far away is no exception

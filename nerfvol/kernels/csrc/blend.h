@@ -2,8 +2,6 @@
 //
 // w = T alpha, C += w c, T -= w; a pixel ends with the Gaussian at which T falls below early_stop_eps.
 #pragma once
-#include <cmath>
-
 #include "splat_order.h"
 
 namespace NERFVOL_ISA {
@@ -30,8 +28,8 @@ struct Footprint {
     Footprint(const Record& record, float left, float top)
         : dx(load<f16>(kLaneX) + (left + 0.5f - record.x)), dy(load<f16>(kLaneY) + (top + 0.5f - record.y)), g(record) {}
 
-    f16 x(int block) const { return dx + 4.0f * float(block & 3); }
-    f16 y(int block) const { return dy + 4.0f * float(block >> 2); }
+    f16 x(int block) const { return dx + kBlockX[block]; }
+    f16 y(int block) const { return dy + kBlockY[block]; }
     // 0 below 1/255 and where the pixel has ended.
     f16 alpha(int block, const f16& trans, float eps) const {
         const f16 px = x(block), py = y(block);

@@ -5,6 +5,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <optional>
 #include <stdexcept>
 #include <vector>
@@ -42,6 +43,7 @@ Splats make_splats(const Params& params, int64_t n, bool mip) {
     require(coefficients == 3 || coefficients == 12 || coefficients == 27 || coefficients == 48,
             "splats must have 11 + 3 K rows, K = 1, 4, 9 or 16");
     require(n >= 0 && (n + kSplatLanes - 1) / kSplatLanes == int64_t(params.shape(0)), "the blocks do not fit the number of splats");
+    require(n < int64_t(1) << 26, "there can be at most 2^26 splats");  // entries of tiles have 26 bits for them
     require_lines(params);
     return {params.data(), int64_t(params.shape(0)), n, int(coefficients / 3), mip};
 }
@@ -49,7 +51,8 @@ Splats make_splats(const Params& params, int64_t n, bool mip) {
 void init_view(SplatView* self, const std::vector<float>& rotation, const std::vector<float>& translation,
                const std::vector<float>& eye, const std::vector<float>& lens, float near, int64_t width, int64_t height) {
     require(rotation.size() == 9 && translation.size() == 3 && eye.size() == 3 && lens.size() == 4, "a view has 9 + 3 + 3 + 4 numbers");
-    require(near > 0 && width > 0 && height > 0 && width <= 1 << 20 && height <= 1 << 20, "a view needs a size and a near plane");
+    require(near > 0 && width > 0 && height > 0, "a view needs a size and a near plane");
+    require(width <= 1 << 20 && height <= (int64_t(1) << 30) / width, "a picture must have at most 2^30 pixels");  // entries have 22 bits
     auto* v = new (self) SplatView{};
     std::copy(rotation.begin(), rotation.end(), v->rotation);
     std::copy(translation.begin(), translation.end(), v->translation);

@@ -32,8 +32,8 @@ inline void copy_tile(const float (&tile)[16][16], float* out, int stride, const
 // Depths along the axis become distances along the pixels' rays.
 inline void along_rays(float (&tile)[16][16], const SplatView& v, float left, float top) {
     for (int block = 0; block < 16; ++block) {
-        const f16 x = (load<f16>(kLaneX) + (left + 4.0f * float(block & 3) + 0.5f - v.cx)) * (1 / v.fx);
-        const f16 y = (load<f16>(kLaneY) + (top + 4.0f * float(block >> 2) + 0.5f - v.cy)) * (1 / v.fy);
+        const f16 x = (load<f16>(kLaneX) + (left + kBlockX[block] + 0.5f - v.cx)) * (1 / v.fx);
+        const f16 y = (load<f16>(kLaneY) + (top + kBlockY[block] + 0.5f - v.cy)) * (1 / v.fy);
         store(tile[block], load<f16>(tile[block]) * vsqrt(x * x + y * y + 1.0f));
     }
 }

@@ -3,6 +3,7 @@
 // Tiles leave lines in slots that lie together for each Gaussian, and every sum has an order fixed by the picture, so the result
 // has the same bits for any number of threads. There are no atomics and no array of gradients.
 #pragma once
+#include <cmath>
 #include <deque>
 
 #include "splat_chain.h"
