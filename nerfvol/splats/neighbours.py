@@ -39,7 +39,10 @@ def nearest(
 
 
 def _all_pairs(
-    points: NDArray[np.float64], queries: NDArray[np.float64] | None, squared: NDArray[np.float64], index: NDArray[np.int32]
+    points: NDArray[np.float64],
+    queries: NDArray[np.float64] | None,
+    squared: NDArray[np.float64],
+    index: NDArray[np.int32],
 ) -> None:
     """The same in numpy: time grows with the square of the points."""
     k, asked = squared.shape[1], points if queries is None else queries

@@ -133,7 +133,9 @@ class PlyFile:
             row = 2 * len(self.dtypes)  # a digit and a space or the line's end
         have = self._size - self._rows_at + (self.format == "ascii")
         if self.count * row > have:
-            raise self.fault(f"it declares {self.count} vertices, which need {self.count * row} bytes, and holds {have}")
+            raise self.fault(
+                f"it declares {self.count} vertices, which need {self.count * row} bytes, and holds {have}"
+            )
 
     def read(self) -> dict[str, NDArray]:
         """The vertices' properties by name, each an array (count,) of native byte order."""

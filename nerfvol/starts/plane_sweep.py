@@ -114,8 +114,17 @@ def depth_maps(views: Sequence[SweepView], near: float, far: float) -> list[Dept
         maps[k, n] = _map(cameras[chosen[k]], cameras[others[k, n]])
     first, step = 1 / far, (1 / near - 1 / far) / (PLANES - 1)
     outputs = [[np.empty(greys[i].shape, np.float32) for i in chosen] for _ in range(3)]
-    work = (greys, masks, chosen.astype(np.int32), others.astype(np.int32), maps.astype(np.float32),
-            _apart(maps, others, step), PLANES, first, step)
+    work = (
+        greys,
+        masks,
+        chosen.astype(np.int32),
+        others.astype(np.int32),
+        maps.astype(np.float32),
+        _apart(maps, others, step),
+        PLANES,
+        first,
+        step,
+    )
     compiled = native()
     (compiled.plane_sweep if compiled is not None else sweep_reference.plane_sweep)(*work, *outputs)
     # A pixel whose rivals all lie beyond the other pictures' edges (-1) has not been compared with anything.
@@ -142,7 +151,9 @@ def neighbours_of(cameras: Sequence[Camera], i: int, depth: float) -> NDArray[np
     ranked = [int(j) for j in np.argsort(cost, kind="stable") if usable[j]]
     spread: list[int] = []
     for j in ranked:
-        if len(spread) < NEIGHBOURS and all(np.linalg.norm(centres[j] - centres[k]) > 0.5 * baseline[j] for k in spread):
+        if len(spread) < NEIGHBOURS and all(
+            np.linalg.norm(centres[j] - centres[k]) > 0.5 * baseline[j] for k in spread
+        ):
             spread.append(j)
     chosen = (spread + [j for j in ranked if j not in spread])[:NEIGHBOURS]
     return np.array(chosen + [-1] * (NEIGHBOURS - len(chosen)), np.int64)
@@ -220,6 +231,7 @@ def _points_of(view: SweepView, found: DepthMap, share: float, rng: np.random.Ge
 
 def _nearest_pixels(known: NDArray[np.int64], asked: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int64]:
     """For each asked flat pixel number the known one that is nearest to it."""
+
     def places(flat: NDArray[np.int64]) -> NDArray[np.float64]:
         return np.stack([*np.unravel_index(flat, shape), np.zeros(len(flat))], axis=1).astype(np.float64)
 

@@ -54,7 +54,7 @@ def _seen(
     i1, j1, au, av = np.minimum(i + 1, width - 1), np.minimum(j + 1, height - 1), u - i, v - j
     top, low = (grey[row, i] + au * (grey[row, i1] - grey[row, i]) for row in (j, j1))
     if mask is not None:
-        inside &= mask[np.minimum((v + 0.5).astype(int), height - 1), np.minimum((u + 0.5).astype(int), width - 1)] > 0
+        inside &= mask[(v + 0.5).astype(int), (u + 0.5).astype(int)] > 0
     return top + av * (low - top), inside
 
 
@@ -75,9 +75,7 @@ def _zncc(a: Float, b: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArra
 def _shift(scores: NDArray[np.float64], best: NDArray[np.int64]) -> NDArray[np.float64]:
     """The top of the parabola through the best plane's score and its neighbours', in planes from the best."""
     planes = len(scores)
-    before, top, after = (
-        np.take_along_axis(scores, np.clip(best + k, 0, planes - 1)[None], 0)[0] for k in (-1, 0, 1)
-    )
+    before, top, after = (np.take_along_axis(scores, np.clip(best + k, 0, planes - 1)[None], 0)[0] for k in (-1, 0, 1))
     bend = before - 2 * top + after
     between = (best > 0) & (best < planes - 1) & (before > -1) & (after > -1) & (bend < 0)
     return np.where(between, np.clip(0.5 * (before - after) / np.where(between, bend, 1), -0.5, 0.5), 0.0)
