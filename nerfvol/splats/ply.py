@@ -161,7 +161,7 @@ def _check_values(file: PlyFile, splats: Splats) -> None:
     bounds = (
         ("position", splats.means, LARGEST),
         ("rotation", splats.quats, LARGEST_COEFFICIENT),
-        ("colour", splats.sh.reshape(splats.n, -1), LARGEST_COEFFICIENT),
+        ("colour", splats.sh.reshape(splats.n, 3 * splats.sh.shape[2]), LARGEST_COEFFICIENT),
     )
     for what, values, bound in bounds:
         good = (np.abs(values) < bound).all(axis=1)  # fails for what is no number as well
