@@ -49,7 +49,7 @@ def through_lens(render_pinhole: Callable[[Camera], Pictures], camera: Camera) -
         The same names, float32, of the camera's size. All are resampled bicubically but "depth" and "median_depth"
         (distances along the ray): a hole (0, infinite, no number) where the nearest pixel is one, else the mean of those of
         the four pixels around that are within 5 % of the nearest one's, by bilinear weights: no distance lies between two
-        surfaces. "normal" is made a unit vector again.
+        surfaces. "opacity" stays within 0 and 1, "normal" is made a unit vector again.
     """
     lens = camera.intrinsics
     if is_pinhole(lens):
@@ -86,6 +86,8 @@ def _resampled(name: str, picture: Float, places: Float) -> Float:
     if name in DISTANCES:
         return _distances(picture, places)
     values = sample(picture, places, cubic=True)
+    if name == "opacity":  # the bicubic goes beyond the values it lies between
+        return np.clip(values, 0.0, 1.0)
     if name == "normal":
         values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
     return values

@@ -159,6 +159,3 @@ def estimate_bytes(cameras: Sequence[Camera], factors: Sequence[int] = FACTORS, 
             lens = level_camera(canvas, factor)
             total += 4 * lens.width * lens.height
     return total
-
-
-# ------------------------------------------------------------------ back through the lens

@@ -40,7 +40,10 @@ def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
     Raises:
         InputError: the path cannot be written, or a value is not finite.
     """
-    splats.validate()
+    try:
+        splats.validate()
+    except InputError as error:
+        raise InputError(f"cannot write {path}: {error}") from error
     columns: dict[str, NDArray[np.float32]] = {}
     means = splats.means.astype(np.float64) + splats.origin if np.any(splats.origin) else splats.means
     with np.errstate(over="ignore"):
@@ -50,7 +53,7 @@ def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
     columns |= {name: means[:, k] for k, name in enumerate("xyz")}
     columns |= {name: np.zeros(splats.n, np.float32) for name in ("nx", "ny", "nz")}
     columns |= {f"f_dc_{k}": splats.sh[:, k, 0] for k in range(3)}
-    rest = splats.sh[:, :, 1:].reshape(splats.n, -1)  # channel by channel
+    rest = splats.sh[:, :, 1:].reshape(splats.n, 3 * (splats.sh.shape[2] - 1))  # channel by channel
     columns |= {f"f_rest_{k}": rest[:, k] for k in range(rest.shape[1])}
     columns["opacity"] = splats.logits
     columns |= {f"scale_{k}": splats.log_scales[:, k] for k in range(3)}
@@ -88,7 +91,7 @@ def load_ply(path: str | os.PathLike[str], mode: Mode = "plain") -> Splats:
         names = [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
         sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, :, None]
         if names:
-            sh = np.concatenate([sh, columns(*names).reshape(len(sh), 3, -1)], axis=2)
+            sh = np.concatenate([sh, columns(*names).reshape(len(sh), 3, len(names) // 3)], axis=2)
         splats = Splats(
             means=columns("x", "y", "z"), log_scales=_log_scales(file, columns("scale_0", "scale_1", "scale_2")),
             quats=columns(*(f"rot_{k}" for k in range(4))), logits=_logits(file, columns("opacity")[:, 0]), sh=sh,
@@ -158,7 +161,7 @@ def _check_values(file: PlyFile, splats: Splats) -> None:
     bounds = (
         ("position", splats.means, LARGEST),
         ("rotation", splats.quats, LARGEST_COEFFICIENT),
-        ("colour", splats.sh.reshape(splats.n, -1), LARGEST_COEFFICIENT),
+        ("colour", splats.sh.reshape(splats.n, 3 * splats.sh.shape[2]), LARGEST_COEFFICIENT),
     )
     for what, values, bound in bounds:
         good = (np.abs(values) < bound).all(axis=1)  # fails for what is no number as well

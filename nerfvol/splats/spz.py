@@ -54,7 +54,10 @@ def save_spz(path: str | os.PathLike[str], splats: Splats, version: int = 3) -> 
     if version not in VERSIONS:
         raise InputError(f"the version of an .spz file must be 3 or 4, got {version!r}")
     gsply = _library()
-    splats.validate()
+    try:
+        splats.validate()
+    except InputError as error:
+        raise InputError(f"cannot write {path}: {error}") from error
     means = splats.means.astype(np.float64) + splats.origin
     largest = float(np.abs(means).max(initial=0.0))
     bits = _POSITION_BITS if largest <= 1 else _POSITION_BITS - int(np.ceil(np.log2(largest * (1 + 1e-6))))

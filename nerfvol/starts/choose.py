@@ -50,16 +50,13 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
         raise InputError(f"the start {name!r} cannot be used: {found}")
     if not len(cloud):
         cloud = random_points(dataset.scene, seed=seed)
-        found, chosen = (
-            f"{found}; {len(cloud)} random points in the scene's box stand in, expect a poor result",
-            "random",
-        )
+        chosen, found = "random", f"{found}; {len(cloud)} random points in the scene's box stand in: expect little"
     return Start(cloud, subject, chosen, f"start: {found} ({why})")
 
 
 def _suited(dataset: Dataset) -> tuple[str, str]:
     """The row that suits a dataset and why."""
-    if dataset.scene.background_cube is None:
+    if dataset.scene.has_alpha:
         return "random", "an object on a transparent background is seen whole"
     if points_file(dataset) is None:
         return "sweep", "photographs with poses alone"

@@ -1,7 +1,8 @@
-"""The points of a COLMAP model with their colours: where structure from motion found the same spot in several photographs.
+"""The points of a model with their colours: where structure from motion found the same spot in several photographs.
 
-Read from the model beside the dataset's poses, ``points3D.bin`` or ``points3D.txt`` (COLMAP documentation, "Output
-Format"): id, x y z, r g b, reprojection error in pixels, and the track, the observations that a point was found by.
+nerfstudio's transforms.json names a PLY file of them (``ply_file_path``). COLMAP's are read from beside the poses,
+``points3D.bin`` or ``points3D.txt`` (COLMAP documentation, "Output Format"): id, x y z, r g b, reprojection error in pixels,
+and the track, the observations that a point was found by.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from numpy.typing import NDArray
 
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
-from nerfvol.files.atomic import read_bytes
-from nerfvol.splats.points import PointCloud
+from nerfvol.files.atomic import read_bytes, read_json
+from nerfvol.splats.points import PointCloud, read_points
 
 SHORTEST_TRACK = 3
 LARGEST_ERROR = 2.0
@@ -25,8 +26,11 @@ _ROW = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "
 
 
 def points_file(dataset: Dataset) -> Path | None:
-    """The file with the points of the COLMAP model that the dataset's poses are from; None where there is none."""
+    """The file with the points of the model that the dataset's poses are from; None where there is none."""
     source = Path(dataset.source)
+    if source.suffix == ".json" and source.is_file():
+        named = read_json(source).get("ply_file_path")
+        return source.parent / named if isinstance(named, str) and _is_file(source.parent, named) else None
     if source.name not in ("images.bin", "images.txt"):
         return None
     for name in ("points3D" + source.suffix, "points3D.bin", "points3D.txt"):
@@ -35,8 +39,14 @@ def points_file(dataset: Dataset) -> Path | None:
     return None
 
 
+def _is_file(folder: Path, name: str) -> bool:
+    """Whether the folder has such a PLY file."""
+    return "\0" not in name and name.lower().endswith(".ply") and (folder / name).is_file()
+
+
 def model_points(dataset: Dataset) -> tuple[PointCloud, str]:
-    """The model's points with at least 3 observations and an error below 2 pixels, and a sentence on what was found.
+    """The model's points and a sentence on what was found; of COLMAP's those with at least 3 observations and an error
+    below 2 pixels.
 
     The cloud is empty where there is no model or no such point; the sentence says so.
 
@@ -45,7 +55,10 @@ def model_points(dataset: Dataset) -> tuple[PointCloud, str]:
     """
     path = points_file(dataset)
     if path is None:
-        return PointCloud.empty(), f"{dataset.source} comes without the points of a COLMAP model"
+        return PointCloud.empty(), f"{dataset.source} comes without the points of a model"
+    if path.suffix.lower() == ".ply":
+        cloud = read_points(path)
+        return cloud, f"{len(cloud)} points of {path}"
     positions, colours, errors, tracks = _read_binary(path) if path.suffix == ".bin" else _read_text(path)
     good = (tracks >= SHORTEST_TRACK) & (errors < LARGEST_ERROR) & (np.abs(positions) < _FARTHEST).all(axis=1)
     cloud = PointCloud(positions[good], (colours[good] / 255).astype(np.float32))

@@ -54,7 +54,7 @@ def _seen(
     i1, j1, au, av = np.minimum(i + 1, width - 1), np.minimum(j + 1, height - 1), u - i, v - j
     top, low = (grey[row, i] + au * (grey[row, i1] - grey[row, i]) for row in (j, j1))
     if mask is not None:
-        inside &= mask[np.minimum((v + 0.5).astype(int), height - 1), np.minimum((u + 0.5).astype(int), width - 1)] > 0
+        inside &= mask[(v + 0.5).astype(int), (u + 0.5).astype(int)] > 0
     return top + av * (low - top), inside
 
 

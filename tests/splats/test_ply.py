@@ -200,6 +200,19 @@ def test_a_mode_that_nobody_knows_is_refused(tmp_path, comment):
         load_ply(path)
 
 
+def test_what_cannot_be_written_leaves_nothing(tmp_path):
+    splats = make_splats()
+    splats.logits[2] = np.nan
+    with pytest.raises(InputError, match="cannot write .*a.ply: "):
+        save_ply(tmp_path / "a.ply", splats)
+    with pytest.raises(InputError, match="too large for the format"):
+        save_ply(tmp_path / "a.ply", make_splats(origin=(1e39, 0, 0)))
+    with pytest.raises(InputError, match="cannot write .*its folder does not exist"):
+        save_ply(tmp_path / "none" / "a.ply", make_splats())
+    assert not list(tmp_path.iterdir())
+    assert save_ply(tmp_path / "b.ply", make_splats(n=0)) and load_ply(tmp_path / "b.ply").n == 0
+
+
 def test_files_that_are_not_there(tmp_path):
     for path, words in ((tmp_path / "none.ply", "no such"), (tmp_path, "folder")):
         with pytest.raises(InputError, match=words):
@@ -276,7 +289,9 @@ def test_points_become_gaussians_as_wide_as_they_are_apart():
     normal = np.array([0.3, -0.5, -0.8])
     normal /= np.linalg.norm(normal)
     places = grid()
-    cloud = PointCloud(places, np.full((49, 3), [0.2, 0.5, 0.9], np.float32), np.tile(normal, (49, 1)).astype(np.float32))
+    cloud = PointCloud(
+        places, np.full((49, 3), [0.2, 0.5, 0.9], np.float32), np.tile(normal, (49, 1)).astype(np.float32)
+    )
     middle = 24  # its 8 neighbours: four at 1 step, four at sqrt(2)
     splats = splats_of_points(cloud, scale=1.0)
     splats.validate()

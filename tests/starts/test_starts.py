@@ -158,6 +158,21 @@ def test_good_points_of_a_model(tmp_path, text):
     assert "3 of the 6 points" in sentence and str(path) in sentence
 
 
+def test_points_that_a_transforms_json_names(tmp_path):
+    for number, named in enumerate(("sparse_pc.ply", "none.ply", 7, "transforms.json", "a\0.ply", None)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        scenes.write_nerfstudio(folder, scenes.ring(), scenes.random_images(), ply_file_path=named)
+        head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+        head += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        (folder / "sparse_pc.ply").write_text(head + "0 1 2 255 0 51\n3 4 5 0 0 0\n")
+        cloud, sentence = model_points(load_dataset(folder))
+        assert len(cloud) == (2 if named == "sparse_pc.ply" else 0), sentence
+        if len(cloud):
+            np.testing.assert_array_equal(cloud.positions, [[0, 1, 2], [3, 4, 5]])
+            np.testing.assert_allclose(cloud.colours[0], [1, 0, 0.2], atol=1e-7)
+
+
 def test_damaged_points_of_a_model(tmp_path):
     data, path = colmap_dataset(tmp_path, text=False)
     whole = path.read_bytes()

@@ -304,6 +304,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.attr("__version__") = NERFVOL_VERSION;
     m.attr("TILE") = kTile;
     m.attr("MAX_LEVEL") = kMaxLevel;
+    bind_photographs(m);
     nb::class_<TreeArrays>(m, "Tree").def(
         "__init__", &init_tree,
         "node_mask"_a, "leaf_mask"_a, "first_node"_a, "first_leaf"_a, "corners"_a, "values"_a, "sh_degree"_a, "origin"_a, "size"_a,
@@ -323,7 +324,6 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("restrict_cells", &py_restrict_cells, "mask"_a, "first"_a, "corners"_a, "rows"_a, "weight"_a, "density"_a, "sums"_a);
     m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "row"_a, "out"_a, "target"_a);
     bind_splats(m);
-    bind_photographs(m);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
     m.def("isa", [] { return std::string(isa_name()); });

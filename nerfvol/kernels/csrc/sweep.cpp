@@ -14,6 +14,12 @@ constexpr int kBand = 32;       // rows after which running sums begin anew, so 
 constexpr float kFloor = 4e-5f; // of a window's variance sum: what is flatter than this has no texture
 constexpr float kMiddle = 0.5f; // taken off all greys: sums of squares of small numbers lose less
 
+// A picture with its mask as numbers, which vectors can gather; null where it is one everywhere.
+struct Picture {
+    const float *grey, *solid;
+    int height, width;
+};
+
 // What a thread needs for one reference; rows have kRadius zeros on both sides where windows reach over the edge.
 struct Workspace {
     std::vector<float> ref, mean, deviation, other, valid, first, second, previous, best, before, after, rival, count;
@@ -22,7 +28,8 @@ struct Workspace {
 };
 
 // Greys of `to` seen from row y of the reference through plane w, and 1 where they are on the picture.
-NERFVOL_INLINE void warp_row(const Grey& to, const float* map, float w, int y, int width, float* out, float* valid) {
+template <bool kMasked>
+NERFVOL_INLINE void warp_row(const Picture& to, const float* map, float w, int y, int width, float* out, float* valid) {
     const float fy = float(y) + 0.5f;
     const float x0 = map[1] * fy + map[2] + w * map[9], y0 = map[4] * fy + map[5] + w * map[10],
                 z0 = map[7] * fy + map[8] + w * map[11];
@@ -30,8 +37,7 @@ NERFVOL_INLINE void warp_row(const Grey& to, const float* map, float w, int y, i
     const float last_x = float(to.width - 1), last_y = float(to.height - 1);
     const int stride = to.width, most_x = std::max(to.width - 2, 0), most_y = std::max(to.height - 2, 0);
     const int dx = to.width > 1 ? 1 : 0, dy = to.height > 1 ? stride : 0;
-    const float* grey = to.grey;
-    const uint8_t* mask = to.mask;
+    const float *grey = to.grey, *solid = to.solid;
 #pragma GCC ivdep
     for (int x = 0; x < width; ++x) {
         const float fx = float(x) + 0.5f;
@@ -52,15 +58,9 @@ NERFVOL_INLINE void warp_row(const Grey& to, const float* map, float w, int y, i
         const float top = grey[at] + au * (grey[at + dx] - grey[at]);
         const float low = grey[at + dy] + au * (grey[at + dy + dx] - grey[at + dy]);
         out[x] = top + av * (low - top) - kMiddle;
-        valid[x] = inside ? 1.0f : 0.0f;
-    }
-    if (!mask) return;
-    for (int x = 0; x < width; ++x) {
-        if (valid[x] == 0.0f) continue;
-        const float fx = float(x) + 0.5f, inverse = 1.0f / (map[6] * fx + z0);
-        const int iu = std::min(int((map[0] * fx + x0) * inverse), to.width - 1);
-        const int iv = std::min(int((map[3] * fx + y0) * inverse), to.height - 1);
-        valid[x] = mask[iv * stride + iu] ? 1.0f : 0.0f;
+        float there = inside ? 1.0f : 0.0f;
+        if (kMasked) there *= solid[int(sv + 0.5f) * stride + int(su + 0.5f)];
+        valid[x] = there;
     }
 }
 
@@ -135,7 +135,7 @@ NERFVOL_INLINE void correlate(const float* b, int height, int width, Workspace& 
 }
 
 // The reference's own window means (times 1, not n) and square roots of its variance sums.
-NERFVOL_INLINE void prepare(const Grey& picture, Workspace& s) {
+NERFVOL_INLINE void prepare(const Picture& picture, Workspace& s) {
     const int height = picture.height, width = picture.width;
     const size_t n = size_t(height) * width;
     for (auto* v : {&s.ref, &s.mean, &s.deviation, &s.other, &s.valid, &s.first, &s.second, &s.previous, &s.before, &s.after})
@@ -175,8 +175,8 @@ NERFVOL_INLINE void record(int plane, int others, int apart, size_t n, Workspace
     }
 }
 
-NERFVOL_INLINE void sweep_body(const std::vector<Grey>& pictures, const Reference& r, int planes, float first, float step, Workspace& s) {
-    const Grey& picture = pictures[size_t(r.picture)];
+NERFVOL_INLINE void sweep_body(const std::vector<Picture>& pictures, const Reference& r, int planes, float first, float step, Workspace& s) {
+    const Picture& picture = pictures[size_t(r.picture)];
     const int height = picture.height, width = picture.width;
     const size_t n = size_t(height) * width;
     prepare(picture, s);
@@ -185,9 +185,13 @@ NERFVOL_INLINE void sweep_body(const std::vector<Grey>& pictures, const Referenc
         std::fill(s.first.begin(), s.first.end(), -1.0f);
         std::fill(s.second.begin(), s.second.end(), -1.0f);
         for (const Comparison& c : r.others) {
-            for (int y = 0; y < height; ++y)
-                warp_row(pictures[size_t(c.picture)], c.map, first + step * float(plane), y, width,
-                         s.other.data() + size_t(y) * width, s.valid.data() + size_t(y) * width);
+            const Picture& to = pictures[size_t(c.picture)];
+            const float w = first + step * float(plane);
+            for (int y = 0; y < height; ++y) {
+                float *other = s.other.data() + size_t(y) * width, *valid = s.valid.data() + size_t(y) * width;
+                if (to.solid) warp_row<true>(to, c.map, w, y, width, other, valid);
+                else warp_row<false>(to, c.map, w, y, width, other, valid);
+            }
             correlate(s.other.data(), height, width, s);
         }
         record(plane, int(r.others.size()), r.apart, n, s);
@@ -198,21 +202,21 @@ NERFVOL_INLINE void sweep_body(const std::vector<Grey>& pictures, const Referenc
         const bool between = s.at[i] > 0 && s.at[i] < planes - 1 && s.before[i] > -1.0f && s.after[i] > -1.0f && bend < 0.0f;
         const float shift = between ? std::min(std::max(0.5f * (s.before[i] - s.after[i]) / bend, -0.5f), 0.5f) : 0.0f;
         r.inverse_depth[i] = first + step * (float(s.at[i]) + shift);
-        r.score[i] = s.at[i] < 0 || (picture.mask && !picture.mask[i]) ? -1.0f : s.best[i];
+        r.score[i] = s.at[i] < 0 || (picture.solid && picture.solid[i] == 0.0f) ? -1.0f : s.best[i];
         r.rival[i] = s.rival[i];
     }
 }
 
-using Sweep = void (*)(const std::vector<Grey>&, const Reference&, int, float, float, Workspace&);
+using Sweep = void (*)(const std::vector<Picture>&, const Reference&, int, float, float, Workspace&);
 
-void sweep_baseline(const std::vector<Grey>& p, const Reference& r, int n, float first, float step, Workspace& s) {
+void sweep_baseline(const std::vector<Picture>& p, const Reference& r, int n, float first, float step, Workspace& s) {
     sweep_body(p, r, n, first, step, s);
 }
 #ifdef NERFVOL_CLONES
-NERFVOL_AVX2 void sweep_avx2(const std::vector<Grey>& p, const Reference& r, int n, float first, float step, Workspace& s) {
+NERFVOL_AVX2 void sweep_avx2(const std::vector<Picture>& p, const Reference& r, int n, float first, float step, Workspace& s) {
     sweep_body(p, r, n, first, step, s);
 }
-NERFVOL_AVX512 void sweep_avx512(const std::vector<Grey>& p, const Reference& r, int n, float first, float step, Workspace& s) {
+NERFVOL_AVX512 void sweep_avx512(const std::vector<Picture>& p, const Reference& r, int n, float first, float step, Workspace& s) {
     sweep_body(p, r, n, first, step, s);
 }
 #endif
@@ -231,8 +235,15 @@ void plane_sweep(const std::vector<Grey>& pictures, const std::vector<Reference>
     const int threads = get_threads();
     std::vector<Workspace> spaces(static_cast<size_t>(threads));
     const Sweep sweep = chosen();
+    std::vector<std::vector<float>> masks(pictures.size());
+    std::vector<Picture> solid;
+    for (size_t i = 0; i < pictures.size(); ++i) {
+        const Grey& p = pictures[i];
+        if (p.mask) masks[i].assign(p.mask, p.mask + size_t(p.height) * p.width);
+        solid.push_back({p.grey, p.mask ? masks[i].data() : nullptr, p.height, p.width});
+    }
     parallel_for(int(references.size()), [&](int i, int thread) {
-        sweep(pictures, references[size_t(i)], n, first, step, spaces[size_t(thread)]);
+        sweep(solid, references[size_t(i)], n, first, step, spaces[size_t(thread)]);
     });
 }
 
