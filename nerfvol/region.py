@@ -1,7 +1,7 @@
-"""The scene's region, in numbers only: an inner cube of detail and, around photographs, shells of doubling cells.
+"""The scene's region, in numbers only: an inner cube of detail and, for photographs, background shells of doubling cells.
 
-Around the inner cube, ``aabb``'s, each shell reaches twice as far as the one inside it with cells twice as large, so that
-cells look about equally large from the middle.
+The inner cube is the smallest around ``aabb``. Each background shell reaches twice as far as the one inside it with cells
+twice as large, so that cells look about equally large from the middle.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ class SceneBounds:
     """Where the scene is, in scene units.
 
     ``aabb`` (2, 3) float64, lowest and highest corner: the region of detail.
-    ``background_cube`` (2, 3) or None: the larger cube, concentric with ``aabb``, that holds the surroundings of
-    photographs; None where the background is not part of the scene.
+    ``background_cube`` (2, 3) or None: the larger cube, concentric with ``aabb``, that the background shells of
+    photographs fill; None where the background is not part of the scene.
     ``has_alpha``: the images have transparent pixels, seen over whatever background is asked for.
     """
 
@@ -45,32 +45,37 @@ class SceneBounds:
 
     @property
     def is_unbounded(self) -> bool:
-        """Whether the surroundings belong to the scene, as in photographs."""
+        """Whether the background belongs to the scene, as in photographs: the scene has background shells."""
         return self.background_cube is not None
 
     @property
     def n_shells(self) -> int:
-        """How often the inner cube must double to hold the surroundings; 0 where these are not part of the scene."""
+        """The number of background shells: how often the inner cube doubles to reach ``background_cube``; else 0."""
         if self.background_cube is None:
             return 0
         around = (self.background_cube[1] - self.background_cube[0]).max()
         return max(0, int(np.ceil(np.log2(around / self.side) - 1e-6)))
 
     def finest_levels(self, points: NDArray[np.float64], level: int) -> NDArray[np.int64]:
-        """The finest level of an octree over inner cube and shells at points (n, 3), (n,): ``level`` splits the inner cube
-        into 2**level cells along an edge, and each shell has one level less."""
+        """The finest level (n,) of an octree over inner cube and background shells at points (n, 3), scene units.
+
+        ``level`` splits the inner cube into 2**level cells along an edge; each shell outwards has one level less.
+        """
         distance = np.abs(points - self.center).max(1) / (self.side / 2)
         return level + self.n_shells - np.ceil(np.log2(np.maximum(distance, 1))).astype(np.int64)
 
 
 def cube(center: NDArray[np.float64], half: float) -> NDArray[np.float64]:
-    """(2, 3) corners."""
+    """The corners (2, 3) of the cube around ``center`` (3,) with half its edge ``half``, scene units."""
     return np.stack([center - half, center + half])
 
 
 def check_box(box: ArrayLike, what: str) -> NDArray[np.float64]:
     """The box (2, 3) float64 from (2, 3) or six numbers; InputError unless finite and not empty on any axis."""
-    corners = np.asarray(box, dtype=np.float64)
+    try:
+        corners = np.asarray(box, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):  # ragged lists, text, whole numbers of hundreds of digits
+        raise InputError(f"{what} must be two corners of three numbers, got {box!r:.60}") from None
     if corners.size != 6:
         raise InputError(f"{what} must be two corners of three numbers, got shape {corners.shape}")
     corners = corners.reshape(2, 3).copy()

@@ -1,9 +1,11 @@
-"""Pictures of an octree: one view at a time, to PNG, EXR or MP4."""
+"""One view of a model: colours, depth, opacity and normals."""
 
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,11 @@ from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
 from nerfvol.kernels import ops
 from nerfvol.kernels.state import OUTPUTS, in_squares
+from nerfvol.octree.io import Storage, load_octree, save_octree
 from nerfvol.octree.tree import Octree
+
+if TYPE_CHECKING:
+    from nerfvol.models import Model
 
 Float = NDArray[np.float32]
 
@@ -55,25 +61,75 @@ def unit_normal(image: Mapping[str, Float]) -> Float:
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
 
 
-def depth_range(octree: Octree, cameras: Sequence[Camera]) -> tuple[float, float]:
+def depth_range(model: Model, cameras: Sequence[Camera]) -> tuple[float, float]:
     """Nearest and farthest distance that a few of ``cameras`` see, to scale pictures of depth by.
 
     The 1st and 99th percentile of small renders, a tenth of their distance farther apart: single floaters do not count.
-    Where nothing is seen, the distances at which leaves could be.
+    Where nothing is seen, the distances at which something could be.
     """
     seen = []
     for camera in cameras[:: max(1, len(cameras) // 4)]:
         width = min(camera.intrinsics.width, 96)
         small = camera.resized(width, max(1, round(camera.intrinsics.height * width / camera.intrinsics.width)))
-        image = render_image(octree, small, outputs=("depth", "opacity"))
+        image = model.render(small, outputs=("depth", "opacity"))
         seen.append(surface_depth(image)[image["opacity"] >= 0.5])
     depths = np.concatenate(seen)
     if not len(depths):
-        reach = octree.size * 3**0.5
-        distances = [float(np.linalg.norm(camera.position - octree.origin - octree.size / 2)) for camera in cameras]
+        low, high = model.aabb()
+        reach, middle = float(np.linalg.norm(high - low)), (low + high) / 2
+        distances = [float(np.linalg.norm(camera.position - middle)) for camera in cameras]
         return max(min(distances) - reach / 2, 0.0), max(distances) + reach / 2
     near, far = (float(value) for value in np.percentile(depths, (1, 99)))
     return max(near - 0.1 * (far - near), 0.0), far + 0.1 * (far - near)
 
 
-# ------------------------------------------------------------------ the command
+class OctreeModel:
+    """An octree as a model (models.Model). ``octree`` is the octree itself."""
+
+    kind = "octree"
+
+    def __init__(self, octree: Octree, metadata: Mapping[str, Any] | None = None) -> None:
+        self.octree, self.metadata = octree, dict(metadata or {})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> OctreeModel:
+        """The model in an octree file; InputError where it is none."""
+        return cls(*load_octree(path))
+
+    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
+        """See models.Model; storage: "float32", "float16" or "compact" (octree.io.save_octree)."""
+        return save_octree(path, self.octree, self.metadata, storage)
+
+    def render(
+        self,
+        camera: Camera,
+        background: Sequence[float] | None = None,
+        outputs: Sequence[str] = ("rgb",),
+        early_stop_eps: float = DEFAULT_EARLY_STOP,
+        lod: float = DEFAULT_LOD,
+    ) -> dict[str, Float]:
+        """See models.Model."""
+        colour = self.metadata.get("background", WHITE) if background is None else background
+        return render_image(self.octree, camera, colour, early_stop_eps, outputs, lod)
+
+    def aabb(self) -> NDArray[np.float64]:
+        """(2, 3) corners of the box around all leaves."""
+        half, center = self.octree.leaf_sizes()[:, None] / 2, self.octree.leaf_centers()
+        return np.stack([(center - half).min(axis=0), (center + half).max(axis=0)])
+
+    def describe(self) -> dict[str, Any]:
+        """Counts, leaves by level, the share of the root cube that leaves fill, their bounding box, bytes in memory."""
+        octree = self.octree
+        levels, counts = np.unique(octree.leaf_level, return_counts=True)
+        arrays = octree.values, octree.corners, octree.leaf_ijk, octree.leaf_level
+        masks = octree.node_mask, octree.leaf_mask, octree.first_node, octree.first_leaf
+        return {
+            "nodes": octree.n_nodes,
+            "leaves": octree.n_leaves,
+            "vertices": octree.n_vertices,
+            "leaves_by_level": {int(level): int(count) for level, count in zip(levels, counts, strict=True)},
+            "finest_grid": 2**octree.max_level,
+            "filled_share": float((8.0 ** -levels.astype(float) * counts).sum()),
+            "leaf_bounds": self.aabb().tolist(),
+            "bytes_in_memory": sum(int(array.nbytes) for array in (*arrays, *masks)),
+        }

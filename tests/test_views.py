@@ -103,15 +103,18 @@ def test_normals_point_at_the_viewer(sphere_octree):
 def test_depth_range_is_that_of_what_is_seen(sphere_octree):
     """The near half of a sphere of radius 0.8 seen from distance 3: 2.2 to sqrt(9 - 0.64)."""
     camera = Camera(lens_of(200, 100), look_at((0, 0, 3.0), (0, 0, 0), up=(0, 1, 0)))
-    near, far = views.depth_range(sphere_octree, [camera])
+    near, far = views.depth_range(views.OctreeModel(sphere_octree), [camera])
     margin = 0.1 * (math.sqrt(8.36) - 2.2)
     assert 2.2 - 1.5 * margin < near < 2.2 and math.sqrt(8.36) - margin < far < math.sqrt(8.36) + 1.5 * margin
 
 
-def test_depth_range_of_nothing_is_that_of_the_cube(sphere_octree):
+def test_depth_range_of_nothing_is_that_of_the_model(sphere_octree):
     camera = Camera(lens_of(20, 20), look_at((0, 0, 3.0), (0, 0, 9.0), up=(0, 1, 0)))
-    near, far = views.depth_range(sphere_octree, [camera])
-    assert near == pytest.approx(3 - 3**0.5) and far == pytest.approx(3 + 3**0.5)
+    model = views.OctreeModel(sphere_octree)
+    near, far = views.depth_range(model, [camera])
+    low, high = model.aabb()
+    distance, reach = np.linalg.norm(camera.position - (low + high) / 2), np.linalg.norm(high - low) / 2
+    assert near == pytest.approx(distance - reach) and far == pytest.approx(distance + reach)
 
 
 # ---------------------------------------------------------------- files

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Intrinsics
-from nerfvol.cameras.lens import Coefficients
+from nerfvol.cameras.lens import PINHOLE, BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError
 
 
@@ -30,8 +31,7 @@ class Calibration:
     angle_y: float | None = None
     cx: float | None = None
     cy: float | None = None
-    distortion: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    fisheye: bool = False
+    lens: Lens = PINHOLE
     resizable: bool = False
 
     def intrinsics(self, width: int, height: int) -> Intrinsics:
@@ -44,7 +44,7 @@ class Calibration:
             raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
         cx = 0.5 * width if self.cx is None else self.cx * sx
         cy = 0.5 * height if self.cy is None else self.cy * sy
-        return Intrinsics(width, height, fx, fy, cx, cy, *self.distortion, fisheye=self.fisheye)
+        return Intrinsics(width, height, fx, fy, cx, cy, self.lens)
 
     def _resize(self, width: int, height: int) -> tuple[float, float]:
         stated = (self.width or width, self.height or height)
@@ -66,13 +66,21 @@ def _focal(angle: float | None, size: int) -> float | None:
     return 0.5 * size / math.tan(0.5 * angle)
 
 
-_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+CAMERA_MODELS: dict[str, type[Lens]] = {
+    "OPENCV": BrownConrady,
+    "PINHOLE": BrownConrady,
+    "SIMPLE_PINHOLE": BrownConrady,
+    "SIMPLE_RADIAL": BrownConrady,
+    "RADIAL": BrownConrady,
+    "PERSPECTIVE": BrownConrady,
+    "OPENCV_FISHEYE": Fisheye,
+}
+"""The lens that a JSON file's ``camera_model`` names; of several names a lens is written with its first."""
+_DEFAULT_MODEL = "OPENCV"
 
 
-_FISHEYE_MODELS = ("OPENCV_FISHEYE",)
-
-
-def read_matrix(value: Any) -> np.ndarray:
+def read_matrix(value: Any) -> NDArray[np.float64]:
+    """The float64 array of a JSON list of numbers, of whatever shape; InputError where it is none."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -92,17 +100,20 @@ def finite_number(data: Mapping[str, Any], *keys: str) -> float | None:
 
 
 def read_calibration(data: Mapping[str, Any]) -> Calibration:
-    model = data.get("camera_model", "OPENCV")
-    if model not in _PINHOLE_MODELS + _FISHEYE_MODELS:
-        known = ", ".join(_PINHOLE_MODELS + _FISHEYE_MODELS)
-        raise InputError(f"camera_model {model!r:.40} is not supported; known models: {known}")
+    """The calibration that the keys of a transforms.json state (docs/data.md lists them).
+
+    Raises:
+        InputError: a value that is no number, an unknown or unsupported camera_model.
+    """
+    model = data.get("camera_model", _DEFAULT_MODEL)
+    if not isinstance(model, str) or model not in CAMERA_MODELS:
+        raise InputError(f"camera_model {model!r:.40} is not supported; known models: {', '.join(CAMERA_MODELS)}")
     unsupported = [key for key in ("ftheta_p0", "latlong", "equirectangular") if data.get(key)]
     if unsupported:
         raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
-    fisheye = model in _FISHEYE_MODELS or data.get("is_fisheye") is True
-    k1, k2, k3, k4, p1, p2 = (finite_number(data, key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if fisheye:
-        p1 = p2 = 0.0  # the model has no tangential part; exporters write zeros or leftovers there
+    lens = Fisheye if data.get("is_fisheye") is True else CAMERA_MODELS[model]
+    # What other lenses have is not read: exporters write zeros or leftovers of p1, p2 beside a fisheye lens.
+    coefficients = {name: finite_number(data, name) or 0.0 for name in lens.names()}
     degrees = {key: finite_number(data, key) for key in ("x_fov", "y_fov")}
     angles = [None if v is None else math.radians(v) for v in degrees.values()]
     width, height = (_size(data, key) for key in ("w", "h"))
@@ -115,9 +126,16 @@ def read_calibration(data: Mapping[str, Any]) -> Calibration:
         angle_y=finite_number(data, "camera_angle_y") if angles[1] is None else angles[1],
         cx=finite_number(data, "cx"),
         cy=finite_number(data, "cy"),
-        distortion=(k1, k2, k3, k4, p1, p2),
-        fisheye=fisheye,
+        lens=lens(**coefficients),
     )
+
+
+def lens_keys(lens: Lens) -> dict[str, Any]:
+    """What :func:`read_calibration` reads as ``lens``: its coefficients that are not zero, and its model unless default."""
+    keys: dict[str, Any] = {name: value for name, value in lens.coefficients.items() if value}
+    if type(lens) is not CAMERA_MODELS[_DEFAULT_MODEL]:
+        keys["camera_model"] = next(name for name, model in CAMERA_MODELS.items() if model is type(lens))
+    return keys
 
 
 def _size(data: Mapping[str, Any], key: str) -> int | None:

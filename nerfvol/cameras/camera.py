@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nerfvol.cameras.lens import distort, undistort
+from nerfvol.cameras.lens import LARGEST, PINHOLE, Fisheye, Lens, with_coefficients
 from nerfvol.errors import InputError
 
 Float = NDArray[np.float64]
@@ -30,18 +30,24 @@ Float = NDArray[np.float64]
 TILE_SIDE = 8
 RIGID_TOLERANCE = 1e-3
 _CACHE_BYTES = 256 << 20
-_LARGEST = 1e100  # intrinsics beyond it overflow in the powers of a lens
-_FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
+FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
 
 
-@dataclass(frozen=True)
+def _coefficient(name: str) -> property:
+    return property(lambda self: self.lens.coefficients.get(name, 0.0), doc=f"The lens's {name}; 0 where it has none.")
+
+
+@dataclass(frozen=True, init=False)
 class Intrinsics:
     """Projection of camera axes to pixels: size, focal lengths, principal point (all in pixels) and lens.
 
-    Without ``fisheye`` the lens is OpenCV's pinhole model: radial 1 + k1 r^2 + k2 r^4 + k3 r^6 (+ k4 r^8, nerfstudio's
-    extension; it is *not* OpenCV's rational k4) and tangential p1, p2. With ``fisheye`` it is OpenCV's fisheye model,
-    where the angle theta from the axis lands at theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) and
-    p1, p2 must be zero. Unusable values raise InputError.
+    The lens is a :class:`~nerfvol.cameras.lens.Lens`, without distortion unless given. Its coefficients may be given and
+    read by name here too: ``Intrinsics(..., k1=0.02)`` is a BrownConrady lens, ``Intrinsics(..., k1=0.02, fisheye=True)`` a
+    Fisheye lens, and dataclasses.replace takes both.
+
+    Raises:
+        InputError: a size below 1x1, focal lengths that are not positive, numbers that are not finite, a coefficient that
+            the lens lacks.
     """
 
     width: int
@@ -50,32 +56,49 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
-    k1: float = 0.0
-    k2: float = 0.0
-    k3: float = 0.0
-    k4: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    fisheye: bool = False
+    lens: Lens
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        lens: Lens = PINHOLE,
+        **of_lens: float,
+    ) -> None:
+        if not isinstance(lens, Lens):
+            raise TypeError(f"Intrinsics takes a lens, or its coefficients by name, got {lens!r}")
+        values = (width, height, fx, fy, cx, cy, with_coefficients(lens, of_lens) if of_lens else lens)
+        for field, value in zip(fields(self), values, strict=True):
+            object.__setattr__(self, field.name, value)
+        self._check()
+
+    k1, k2, k3, k4, p1, p2 = map(_coefficient, ("k1", "k2", "k3", "k4", "p1", "p2"))
+
+    @property
+    def fisheye(self) -> bool:
+        """Whether the lens is a Fisheye."""
+        return isinstance(self.lens, Fisheye)
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """The lens's coefficients in their order; all are 0 for a lens that does nothing to its model."""
+        return tuple(self.lens.coefficients.values())
+
+    def _check(self) -> None:
         if self.width < 1 or self.height < 1:
             raise InputError(f"the image size must be at least 1x1 pixels, got {self.width}x{self.height}")
-        for field in fields(self)[2:-1]:
-            value = getattr(self, field.name)
-            if not abs(value) < _LARGEST:
-                raise InputError(f"camera intrinsic {field.name} must be a finite number, got {value}")
-        if not min(self.fx, self.fy) > 1 / _LARGEST:
+        for name in ("fx", "fy", "cx", "cy"):
+            value = getattr(self, name)
+            if not abs(value) < LARGEST:
+                raise InputError(f"camera intrinsic {name} must be a finite number, got {value}")
+        if not min(self.fx, self.fy) > 1 / LARGEST:
             raise InputError(
                 f"the focal lengths must be positive, got fx={self.fx:g}, fy={self.fy:g} (singular intrinsics)"
             )
-        if self.fisheye and (self.p1 or self.p2):
-            raise InputError(f"a fisheye lens has no tangential distortion, got p1={self.p1:g}, p2={self.p2:g}")
-
-    @property
-    def distortion(self) -> tuple[float, float, float, float, float, float]:
-        """k1, k2, k3, k4, p1, p2."""
-        return self.k1, self.k2, self.k3, self.k4, self.p1, self.p2
 
     def scaled(self, k: int) -> Intrinsics:
         """The camera of an image area-averaged over k x k blocks; rows and columns that fill no block are dropped."""
@@ -108,13 +131,13 @@ class Intrinsics:
         """Unit directions (n, 3) float64, camera axes, of positions (n, 2) in pixels; pixel centres end in 1/2."""
         p = np.asarray(pixels, dtype=np.float64)
         plane = np.stack([(p[:, 0] - self.cx) / self.fx, (p[:, 1] - self.cy) / self.fy], axis=1)
-        d = undistort(plane, self.distortion, self.fisheye)
-        return d * np.array([1.0, -1.0, -1.0])  # OpenCV axes (y down, z forward) to OpenGL axes
+        directions = self.lens.undistort(plane)
+        return directions * np.array([1.0, -1.0, -1.0])  # OpenCV axes (y down, z forward) to OpenGL axes
 
     def project(self, points: ArrayLike) -> Float:
         """Image positions (n, 2), in pixels, of points (n, 3) in camera axes; NaN where the lens cannot see them."""
         p = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, -1.0])
-        return distort(p, self.distortion, self.fisheye) * (self.fx, self.fy) + (self.cx, self.cy)
+        return self.lens.distort(p) * (self.fx, self.fy) + (self.cx, self.cy)
 
 
 class _DirectionCache:
@@ -203,14 +226,21 @@ class Camera:
 
 
 def rigid_pose(c2w: ArrayLike) -> Float:
-    """The (4, 4) float64 pose, with the nearest exact rotation, of a camera-to-world matrix (4, 4) or (3, 4)."""
+    """The (4, 4) float64 pose, with the nearest exact rotation, of a camera-to-world matrix (4, 4) or (3, 4).
+
+    The rotation nearest to a matrix U S V^T, in least squares, is U V^T (the orthogonal Procrustes problem, Schönemann
+    1966).
+
+    Raises:
+        InputError: the matrix is no rigid pose to within 1e-3, is not finite or lies beyond 1e15 units.
+    """
     matrix = np.asarray(c2w, dtype=np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(f"a camera pose must be a 4x4 (or 3x4) matrix, got shape {matrix.shape}")
     if not np.isfinite(matrix).all():
         raise InputError("a camera pose must hold finite numbers only, got NaN or infinity")
-    if not np.abs(matrix[:3, 3]).max() < _FARTHEST:
-        raise InputError(f"a camera must be within {_FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
+    if not np.abs(matrix[:3, 3]).max() < FARTHEST:
+        raise InputError(f"a camera must be within {FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
         raise InputError(f"the last row of a camera pose must be 0 0 0 1, got {_numbers(matrix[3])}")
     r = matrix[:3, :3]
@@ -246,7 +276,11 @@ def tile_pixels(width: int, height: int) -> NDArray[np.int64]:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float:
-    """The pose (4, 4) at ``eye`` that looks at ``target`` with ``up`` upwards in the image."""
+    """The pose (4, 4) at ``eye`` (3,) that looks at ``target`` (3,) with ``up`` (3,) upwards in the image.
+
+    Raises:
+        InputError: ``up`` is along the line of sight, or the two points are one.
+    """
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     back = eye - target
     right = np.cross(up, back)
@@ -271,6 +305,9 @@ def orbit(
 
     ``radius`` is the distance to ``center``, ``elevation_deg`` the angle above the plane through ``center`` normal to
     ``up`` (-90 < elevation < 90). The first camera's azimuth is toward the world axis least aligned with ``up``.
+
+    Raises:
+        InputError: no view, no radius, or an elevation at a pole.
     """
     if n < 1 or not radius > 0 or not -90 < elevation_deg < 90:
         raise InputError(

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.calibration import Calibration, lens_keys, read_calibration, read_matrix
 from nerfvol.cameras.camera import Camera, Intrinsics, orbit
+from nerfvol.cameras.focus import focus_point
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json
 
@@ -23,7 +24,6 @@ DEFAULT_SIZE = (800, 800)
 DEFAULT_ANGLE_X = 0.6911
 """Horizontal field of view, radians (40 degrees), where a file states none: that of the NeRF-synthetic scenes."""
 LARGEST_SIDE = 16384
-_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> list[Camera]:
@@ -32,9 +32,6 @@ def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = No
     Raises:
         InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
     """
-    # The dialects' one reader of intrinsics; its own read_cameras insists on images and focal lengths.
-    from nerfvol.cameras.calibration import read_calibration, read_matrix
-
     document = read_json(path)
     frames = document.get("frames") if isinstance(document, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -72,11 +69,9 @@ def cameras_document(cameras: Sequence[Camera], names: Sequence[str]) -> dict[st
         frame: dict[str, Any] = {
             "file_path": name, "w": lens.width, "h": lens.height,
             "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy,
-            **{key: getattr(lens, key) for key in _LENS if getattr(lens, key)},
+            **lens_keys(lens.lens),
             "transform_matrix": camera.c2w.tolist(),
         }  # fmt: skip
-        if lens.fisheye:
-            frame["camera_model"] = "OPENCV_FISHEYE"
         frames.append(frame)
     return {"frames": frames}
 
@@ -88,11 +83,10 @@ def describe_orbit(cameras: Sequence[Camera], aabb: Any) -> dict[str, Any]:
     the middle of ``aabb`` (2, 3); radius and elevation are the medians over the cameras; up is their mean up.
     """
     positions = np.stack([camera.position for camera in cameras])
-    forwards = np.stack([camera.forward for camera in cameras])
     box = np.asarray(aabb, dtype=np.float64)
-    center = _nearest_point_to_axes(positions, forwards)
-    if center is None or np.any(center < box[0]) or np.any(center > box[1]):
-        center = box.mean(axis=0)
+    focus = focus_point(cameras)
+    inside = bool(np.all(focus.point >= box[0]) and np.all(focus.point <= box[1]))
+    center = focus.point if focus.is_clear and inside else box.mean(axis=0)
     up = _mean_up(cameras)
     offsets = positions - center
     radii = np.linalg.norm(offsets, axis=1)
@@ -126,17 +120,6 @@ def default_orbit(aabb: Any) -> dict[str, Any]:
     sphere = 0.5 * float(np.linalg.norm(box[1] - box[0]))
     radius = sphere / math.sin(0.5 * DEFAULT_ANGLE_X)
     return {"center": box.mean(axis=0).tolist(), "radius": radius, "elevation_deg": 25.0}
-
-
-def _nearest_point_to_axes(positions: np.ndarray, forwards: np.ndarray) -> np.ndarray | None:
-    """The least-squares meeting point of the viewing axes; None where they are too parallel or it lies behind them."""
-    projectors = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    normal_matrix = projectors.sum(axis=0)
-    if np.linalg.eigvalsh(normal_matrix)[0] < 1e-3 * len(positions):
-        return None
-    point = np.linalg.solve(normal_matrix, np.einsum("nij,nj->i", projectors, positions))
-    in_front = np.einsum("ni,ni->n", point - positions, forwards) > 0
-    return point if in_front.mean() > 0.5 else None
 
 
 def _mean_up(cameras: Sequence[Camera]) -> np.ndarray:

@@ -1,63 +1,76 @@
-"""``nerfvol bench``: repeatable medians of loading, rendering and training speed."""
+"""``nerfvol bench``: repeatable medians of loading, rendering and training speed, and what they stand against."""
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from nerfvol import __version__
-from nerfvol.cameras.camera import Camera
-from nerfvol.cameras.paths import orbit_cameras
-from nerfvol.cli.target import find_orbit
+from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
+from nerfvol.cli.target import open_target
 from nerfvol.config.values import Count
-from nerfvol.files import run_folder
-from nerfvol.files.atomic import ensure_writable_folder, write_json
-from nerfvol.kernels import ops
-from nerfvol.machine import describe_hardware, usable_cores
-from nerfvol.measure import plots, roofline
-from nerfvol.measure.bench import (
-    BASE_SIZE,
-    VIEWS,
-    exponents,
-    measure_loading,
-    measure_reference,
-    measure_rendering,
-    measure_sizes,
-)
-from nerfvol.octree.io import load_octree
+from nerfvol.errors import InputError
 
 
-def run_bench(options: BenchOptions) -> int:
+@dataclass
+class BenchOptions:
+    """``nerfvol bench``."""
+
+    target: str = ""
+    sizes: tuple[Count, ...] = (400, 800, 1600)
+    repeats: Count = 5
+    reference: bool = True
+    json: str | None = None
+    plot: str | None = None
+    runs: tuple[str, ...] = ()
+    threads: int = 0
+
+
+def arguments(p: argparse.ArgumentParser) -> None:
+    add_target(p)
+    p.add_argument("--sizes", metavar="LIST", help="square picture sizes (default: 400,800,1600)")
+    p.add_argument("--repeats", metavar="N", help="the median of N measurements is reported (default: 5)")
+    p.add_argument("--no-reference", dest="reference", action="store_false",
+                   help="leave out the comparison with plain torch and the paper-size MLP")  # fmt: skip
+    p.add_argument("--json", metavar="FILE", help="write every figure as JSON")
+    p.add_argument("--plot", metavar="FILE", help="draw the curves (.png, .svg or .pdf; needs nerfvol[plot])")
+    p.add_argument("--runs", metavar="RUN", nargs="+", help="with --plot: also PSNR against seconds of these runs")
+
+
+def run(options: BenchOptions) -> int:
     """Measure everything, print tables, write JSON where asked."""
-    if options.json is not None:
-        ensure_writable_folder(Path(options.json).parent)
+    need("bench", target=options.target)
+    from nerfvol.cameras.paths import orbit_cameras
+    from nerfvol.files.atomic import write_json
+    from nerfvol.machine import describe_hardware
+    from nerfvol.measure import bench, plots, roofline
+    from nerfvol.views import OctreeModel
+
+    prepare_outputs(file=options.json)
     if options.plot is not None:
         plots.check_plot(options.plot, options.runs)
-    path = run_folder.octree_path(options.target)
-    threads = options.threads or usable_cores()
-    ops.set_threads(threads)
-    octree, metadata = load_octree(path)
-    orbit = find_orbit(options.target, octree, metadata)
+    threads = set_threads(options.threads)
+    target = open_target(options.target)
+    if not isinstance(target.model, OctreeModel):
+        raise InputError(f"nerfvol bench measures octrees, {target.path} is a model of {target.model.kind}")
+    octree, orbit = target.model.octree, target.orbit()
     machine = roofline.measure_machine(threads)
-
-    def cameras(size: int) -> list[Camera]:
-        return orbit_cameras(VIEWS, orbit, (size, size))
-
+    views = {size: orbit_cameras(bench.VIEWS, orbit, (size, size)) for size in (*options.sizes, bench.BASE_SIZE)}
     record: dict[str, Any] = {
         "nerfvol": __version__,
         "hardware": describe_hardware(),
         "threads": threads,
         "machine": {**vars(machine), "bandwidth": machine.bandwidth},
-        "view_size": BASE_SIZE,
-        "octree": {"path": str(path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
-        "file": measure_loading(path, options.repeats),
-        "render": measure_rendering(octree, [cameras(size) for size in options.sizes], threads, options.repeats),
-        "size": measure_sizes(octree, cameras(BASE_SIZE), options.repeats, machine),
+        "view_size": bench.BASE_SIZE,
+        "octree": {"path": str(target.path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
+        "file": bench.measure_loading(target.path, options.repeats),
+        "render": bench.measure_rendering(octree, [views[size] for size in options.sizes], threads, options.repeats),
+        "size": bench.measure_sizes(octree, views[bench.BASE_SIZE], options.repeats, machine),
     }
-    record["exponents"] = exponents(record["size"])
+    record["exponents"] = bench.exponents(record["size"])
     if options.reference:
-        record["reference"] = measure_reference(octree, cameras(BASE_SIZE), record)
+        record["reference"] = bench.measure_reference(octree, views[bench.BASE_SIZE], record)
     print_tables(record)
     if options.json is not None:
         write_json(options.json, record)
@@ -80,7 +93,7 @@ def print_tables(record: dict[str, Any]) -> None:
         rates = [r["frames_per_second"] for r in record["render"] if (r["isa"], r["threads"]) == (isa, threads)]
         plural = "s" if threads > 1 else " "
         print(f"{isa:10s} {threads:2d} thread{plural} " + "".join(f"{rate:12.2f}" for rate in rates))
-    print(f"\nfinest grid      leaves   frames/s at {BASE_SIZE}²   training rays/s   segments/ray")
+    print(f"\nfinest grid      leaves   frames/s at {record['view_size']}²   training rays/s   segments/ray")
     for row in record["size"]:
         print(
             f"{2 ** row['level']:8d}³ {row['leaves']:12,d} {row['frames_per_second']:16.2f} "
@@ -90,7 +103,7 @@ def print_tables(record: dict[str, Any]) -> None:
     if "reference" in record:
         r = record["reference"]
         print(
-            f"\nrays a second at {BASE_SIZE}²: kernels {r['kernel_rays_per_second']:,.0f}; plain torch "
+            f"\nrays a second at {record['view_size']}²: kernels {r['kernel_rays_per_second']:,.0f}; plain torch "
             f"{r['torch_rays_per_second']:,.0f} ({r['kernel_over_torch']:,.0f} times slower); 8x256 network of the "
             f"NeRF paper {r['paper_mlp_rays_per_second']:,.0f} ({r['kernel_over_paper_mlp']:,.0f} times slower)"
         )
@@ -119,16 +132,11 @@ def _print_roofline(record: dict[str, Any]) -> None:
         )
 
 
-@dataclass
-class BenchOptions:
-    """``nerfvol bench``."""
-
-    target: str = ""
-    sizes: tuple[Count, ...] = (400, 800, 1600)
-    repeats: Count = 5
-    data: str | None = None
-    reference: bool = True
-    json: str | None = None
-    plot: str | None = None
-    runs: tuple[str, ...] = ()
-    threads: int = 0
+COMMAND = Command(
+    summary="Measure rendering, loading and training speed.",
+    example="nerfvol bench run --sizes 400,800 --json bench.json --plot bench.png",
+    options=BenchOptions,
+    arguments=arguments,
+    run=run,
+    place=50,
+)

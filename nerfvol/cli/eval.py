@@ -2,53 +2,78 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from nerfvol import __version__
-from nerfvol.cli.target import resolve_background
+from nerfvol.cli.command import Command, add_drawing, add_target, need, prepare_outputs, set_threads
+from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
 from nerfvol.config.values import Colour, Count, fraction, pixels
-from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.load import load_dataset
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
-from nerfvol.files import pictures, run_folder
-from nerfvol.files.atomic import ensure_writable_folder, write_json
-from nerfvol.kernels import ops
-from nerfvol.machine import describe_hardware
-from nerfvol.measure.scores import evaluate_octree
-from nerfvol.octree.io import load_octree
-from nerfvol.octree.tree import Octree
-from nerfvol.views import Float, depth_range, render_image, surface_depth
+
+if TYPE_CHECKING:
+    from nerfvol.datasets.dataset import Dataset
 
 
-def run_eval(options: EvalOptions) -> int:
-    """``nerfvol eval``: prints the scores and writes what the options ask for."""
+@dataclass
+class EvalOptions:
+    """``nerfvol eval``."""
+
+    target: str = ""
+    data: str | None = None
+    split: Literal["train", "val", "test"] = "val"
+    downscale: Count = 1
+    background: Colour | None = None
+    early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
+    lod: Annotated[float, pixels] = DEFAULT_LOD
+    json: str | None = None
+    save_images: str | None = None
+    truth: str | None = None
+    threads: int = 0
+
+
+def arguments(p: argparse.ArgumentParser) -> None:
+    add_target(p)
+    p.add_argument("--data", metavar="DIR", help="posed images to compare with (default: those of the run)")
+    p.add_argument("--split", metavar="train|val|test", help="which views (default: val)")
+    p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
+    p.add_argument("--json", metavar="FILE", help="write scores, per-image rows, seconds per frame and hardware")
+    p.add_argument("--save-images", metavar="DIR", help="write truth | render | error | depth for every view")
+    p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
+                   "(with --save-images: slices of both)")  # fmt: skip
+    add_drawing(p)
+
+
+def run(options: EvalOptions) -> int:
+    """Prints the scores and writes what the options ask for."""
+    need("eval", target=options.target)
+    set_threads(options.threads)
+    from nerfvol.datasets.load import load_dataset
+    from nerfvol.files.atomic import write_json
+    from nerfvol.measure.scores import comparison_writer, evaluate
+
+    prepare_outputs(options.save_images, options.json)
+    target = open_target(options.target, options.background)
     data = options.data or run_settings(options.target).get("data")
     if not data:
         raise InputError(f"nerfvol eval needs --data DIR: {options.target} has no config.yaml that says what it saw")
-    if options.save_images is not None:
-        ensure_writable_folder(options.save_images)
-    if options.json is not None:
-        ensure_writable_folder(Path(options.json).parent)
-    path = run_folder.octree_path(options.target)
-    octree, metadata = load_octree(path)
-    background = resolve_background(options.background, options.target, metadata)
     dataset = load_dataset(data, options.split, options.downscale)
     for message in dataset.messages:
         print(message, file=sys.stderr)
+    drawing = target.background, options.early_stop_eps, options.lod
     on_view = None
     if options.save_images is not None:
-        on_view = _comparison_writer(Path(options.save_images), octree, dataset, background, options)
-    scores = evaluate_octree(octree, dataset, background, options.early_stop_eps, on_view, options.lod)
-    record = _record(options, scores, str(path), str(data), background, dataset)
+        on_view = comparison_writer(Path(options.save_images), target.model, dataset, *drawing)
+    scores = evaluate(target.model, dataset, *drawing, on_view)
+    record = _record(options, scores, target, str(data), dataset)
     _print_scores(record, options.split)
     if options.truth is not None:
-        record["truth"] = _compare_with_truth(octree, options.truth, options.save_images)
+        record["truth"] = _compare_with_truth(target, options.truth, options.save_images)
     if options.json is not None:
         write_json(options.json, record)
         print(f"scores: {options.json}")
@@ -57,24 +82,32 @@ def run_eval(options: EvalOptions) -> int:
     return 0
 
 
-def _compare_with_truth(octree: Octree, path: str, folder: str | None) -> dict[str, float]:
+def _compare_with_truth(target: Target, path: str, folder: str | None) -> dict[str, float]:
     from nerfvol.measure import truth
+    from nerfvol.views import OctreeModel
 
+    if not isinstance(target.model, OctreeModel):
+        raise InputError(
+            f"--truth compares densities, which {target.path}, a model of {target.model.kind}, does not have"
+        )
     grid = truth.load_grid(path)
-    scores = truth.compare(octree, grid)
+    scores = truth.compare(target.model.octree, grid)
     for name in ("density", "opacity"):
         print(
             f"{name}: relative L1 {scores[f'{name}_relative_l1']:.3f}, correlation {scores[f'{name}_correlation']:.4f}"
         )
     if folder is not None:
-        truth.write_slices(Path(folder) / "density_slices.png", octree, grid)
+        truth.write_slices(Path(folder) / "density_slices.png", target.model.octree, grid)
     return scores
 
 
 def _record(
-    options: EvalOptions, scores: dict[str, Any], path: str, data: str, background: Sequence[float], dataset: Dataset
+    options: EvalOptions, scores: dict[str, Any], target: Target, data: str, dataset: Dataset
 ) -> dict[str, Any]:
     """What ``--json`` holds: the scores and everything they depend on."""
+    from nerfvol.kernels import ops
+    from nerfvol.machine import describe_hardware
+
     sizes = sorted({(camera.intrinsics.width, camera.intrinsics.height) for camera in dataset.cameras})
     return {
         "psnr": scores["psnr"],
@@ -83,7 +116,7 @@ def _record(
         "seconds_per_frame": scores["seconds_per_frame"],
         "image_size": list(sizes[-1]),
         "image_sizes": [list(size) for size in sizes],
-        "background": list(background),
+        "background": list(target.background),
         "split": options.split,
         "downscale": options.downscale,
         "early_stop_eps": options.early_stop_eps,
@@ -91,7 +124,8 @@ def _record(
         "threads": ops.get_threads(),
         "kernel_path": ops.isa(),
         "hardware": describe_hardware(),
-        "octree": path,
+        "model": str(target.path),
+        "representation": target.model.kind,
         "data": data,
         "nerfvol": __version__,
         "rows": scores["rows"],
@@ -111,33 +145,11 @@ def _print_scores(record: dict[str, Any], split: str) -> None:
     )
 
 
-def _comparison_writer(
-    folder: Path, octree: Octree, dataset: Dataset, background: Sequence[float], options: EvalOptions
-) -> Callable[[int, Float, Float], None]:
-    depths = depth_range(octree, dataset.cameras)
-
-    def write(index: int, truth: Float, image: Float) -> None:
-        camera = dataset.cameras[index]
-        geometry = render_image(octree, camera, background, options.early_stop_eps, ("opacity", "depth"), options.lod)
-        depth = pictures.depth_to_grey(surface_depth(geometry), geometry["opacity"], *depths)
-        panels = [truth, image, pictures.error_map(truth, image), depth]
-        pictures.write_png(folder / f"{dataset.names[index]}.png", pictures.side_by_side(panels))
-
-    return write
-
-
-@dataclass
-class EvalOptions:
-    """``nerfvol eval``."""
-
-    target: str = ""
-    data: str | None = None
-    split: Literal["train", "val", "test"] = "val"
-    downscale: Count = 1
-    background: Colour | None = None
-    early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
-    lod: Annotated[float, pixels] = DEFAULT_LOD
-    json: str | None = None
-    save_images: str | None = None
-    truth: str | None = None
-    threads: int = 0
+COMMAND = Command(
+    summary="Score a model (PSNR, SSIM) on the views of a split.",
+    example="nerfvol eval run --data scene --split test --save-images pictures",
+    options=EvalOptions,
+    arguments=arguments,
+    run=run,
+    place=20,
+)

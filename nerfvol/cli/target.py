@@ -1,38 +1,56 @@
-"""What RUN|FILE means to a command: the model, its background and the orbit around it."""
+"""What RUN|FILE means to a command: the model, the background it is seen on and the orbit around it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from nerfvol.cameras.paths import default_orbit, describe_orbit
 from nerfvol.config.assemble import run_settings
+from nerfvol.config.values import Colour, coerce
 from nerfvol.defaults import WHITE
-from nerfvol.octree.tree import Octree
+from nerfvol.files.run_folder import model_path
+
+if TYPE_CHECKING:
+    from nerfvol.models import Model
 
 
-def resolve_background(given: Sequence[float] | None, target: str, metadata: Mapping[str, Any]) -> tuple[float, ...]:
-    """The background to render on: as given, else the run's, else the octree file's, else white."""
-    for candidate in (given, metadata.get("background"), run_settings(target).get("background")):
-        if candidate is not None:
-            from nerfvol.config.values import Colour, coerce
+@dataclass(frozen=True)
+class Target:
+    """A model, where it came from and the RUN|FILE that named it; background: RGB in [0, 1]."""
 
-            return coerce(candidate, Colour, "background")
-    return WHITE
+    name: str
+    path: Path
+    model: Model
+    background: tuple[float, ...]
+
+    def orbit(self) -> Mapping[str, Any]:
+        """The orbit stored with the model, else that of the run's training cameras, else one that shows the model."""
+        from nerfvol.cameras.paths import default_orbit, describe_orbit
+
+        stored = self.model.metadata.get("orbit")
+        if isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys():
+            return stored
+        data = run_settings(self.name).get("data")
+        if data and Path(data).exists():
+            from nerfvol.datasets.load import load_dataset
+
+            dataset = load_dataset(data, "train")
+            return describe_orbit(dataset.cameras, dataset.scene.aabb)
+        return default_orbit(self.model.aabb())
 
 
-def find_orbit(target: str, octree: Octree, metadata: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The orbit stored with the octree, else that of the run's training cameras, else one that shows the octree."""
-    stored = metadata.get("orbit")
-    if isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys():
-        return stored
-    data = run_settings(target).get("data")
-    if data and Path(data).exists():
-        from nerfvol.datasets.load import load_dataset
+def open_target(name: str, background: Sequence[float] | None = None) -> Target:
+    """The model of RUN|FILE; ``background``: as given, else the file's, else the run's, else white.
 
-        dataset = load_dataset(data, "train")
-        return describe_orbit(dataset.cameras, dataset.scene.aabb)
-    size = octree.leaf_sizes()[:, None]
-    center = octree.leaf_centers()
-    return default_orbit([(center - size / 2).min(axis=0), (center + size / 2).max(axis=0)])
+    Raises:
+        InputError: there is no such run or file, or it holds no model.
+    """
+    from nerfvol.models import load_model
+
+    path = model_path(name)
+    model = load_model(path)
+    candidates = background, model.metadata.get("background"), run_settings(name).get("background"), WHITE
+    chosen = next(candidate for candidate in candidates if candidate is not None)
+    return Target(name, path, model, coerce(chosen, Colour, "background"))

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
-from nerfvol.config.values import Colour, Count, Seconds, seconds
+from nerfvol.config.values import Colour, Count, Seconds, box, seconds
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:
@@ -277,13 +277,15 @@ class Config:
     out: str = ""
     """Run folder."""
     init: Literal["mlp", "direct"] = "direct"
-    """Where the octree starts: a small MLP field that is trained and distilled, or a thin, nearly empty octree."""
+    """Where the octree starts: a small MLP field that is trained and distilled, or an octree of low density."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     background: Colour = (1.0, 1.0, 1.0)
     """Colour behind the scene, RGB in [0, 1]; images with alpha are composited on it."""
     downscale: Count = 1
     """Images are area-averaged by this whole factor."""
+    aabb: Annotated[tuple[float, float, float, float, float, float] | None, box] = None
+    """The region of detail, lowest and highest corner in the units of the poses; None: worked out from the cameras."""
     threads: int = 0
     """CPU threads; 0: all cores this process may use."""
     seed: int = 0
@@ -296,8 +298,12 @@ class Config:
     compare_views: Count = 2
     """Held-out views on which field, distilled and fine-tuned octree are compared (a field renders slowly)."""
     field: Any = dataclasses.field(default_factory=FieldConfig)
-    """Section: the MLP field (nerfvol.settings.FieldConfig)."""
+    """Section: the MLP field (FieldConfig)."""
     distill: Any = dataclasses.field(default_factory=DistillConfig)
-    """Section: the field's way into the octree (nerfvol.settings.DistillConfig)."""
+    """Section: the field's way into the octree (DistillConfig)."""
     octree: OctreeConfig = dataclasses.field(default_factory=OctreeConfig)
-    """Section: the octree and its optimisation (nerfvol.settings.OctreeConfig)."""
+    """Section: the octree and its optimisation (OctreeConfig)."""
+
+    def for_scene(self, scene: SceneBounds) -> Config:
+        """The same with a number for each setting that the kind of scene decides."""
+        return dataclasses.replace(self, octree=self.octree.for_scene(scene), distill=self.distill.for_scene(scene))

@@ -213,4 +213,21 @@ def pixels(value: Any) -> Any:
     return number
 
 
+def box(value: Any) -> Any:
+    """Two corners from "x0,y0,z0,x1,y1,z1" or a list of six numbers, the first below the second; None stays."""
+    if value is None or isinstance(value, str) and value.strip().lower() in ("none", "null", ""):
+        return None
+    parts = value.split(",") if isinstance(value, str) else value
+    try:
+        numbers = tuple(float(part) for part in parts)
+    except (TypeError, ValueError):
+        numbers = ()
+    low, high = numbers[:3], numbers[3:]
+    if len(numbers) != 6 or not all(a < b and math.isfinite(b - a) for a, b in zip(low, high, strict=True)):
+        raise ValueError(
+            f"expected x0,y0,z0,x1,y1,z1 with the first corner below the second on each axis, got {value!r}"
+        )
+    return numbers
+
+
 Size = Annotated[tuple[int, int], image_size]

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.cameras.focus import focus_point
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds, cube
 
@@ -28,20 +29,6 @@ class BoundsHint:
     near_far: tuple[float, float] | None = None
 
 
-def focus_point(cameras: Sequence[Camera]) -> tuple[NDArray[np.float64], float]:
-    """The point (3,) nearest to all optical axes (least squares) and how well they fix it, from 0 (parallel) to 2/3.
-
-    The latter is the smallest eigenvalue of the mean of I - d d^T: about the mean squared sine between the axes.
-    """
-    origins = np.stack([camera.position for camera in cameras])
-    axes = np.stack([camera.forward for camera in cameras])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    matrix = across.mean(axis=0)
-    certainty = float(np.linalg.eigvalsh(matrix)[0])
-    right = (across @ origins[:, :, None]).mean(axis=0)[:, 0]
-    return np.linalg.lstsq(matrix, right, rcond=None)[0], certainty
-
-
 def _half_angle_tangent(camera: Camera) -> float:
     """Tangent of the half field of view along the longer side of the image, the lens taken as undistorted."""
     intrinsics = camera.intrinsics
@@ -49,9 +36,9 @@ def _half_angle_tangent(camera: Camera) -> float:
 
 
 def bounds_of_box(box: NDArray[np.float64], has_alpha: bool) -> SceneBounds:
-    """A stated region of detail (2, 3), with the surroundings that photographs need."""
-    surroundings = cube(box.mean(axis=0), BACKGROUND_FACTOR * float((box[1] - box[0]).max()) / 2)
-    return SceneBounds(box, None if has_alpha else surroundings, has_alpha)
+    """Bounds with a stated aabb (2, 3), scene units, and around photographs the background cube, 16 times as large."""
+    background = cube(box.mean(axis=0), BACKGROUND_FACTOR * float((box[1] - box[0]).max()) / 2)
+    return SceneBounds(box, None if has_alpha else background, has_alpha)
 
 
 def _around(center: NDArray[np.float64], half: float, has_alpha: bool) -> SceneBounds:
@@ -61,13 +48,13 @@ def _around(center: NDArray[np.float64], half: float, has_alpha: bool) -> SceneB
 def estimate_bounds(
     cameras: Sequence[Camera], has_alpha: bool, hint: BoundsHint | None = None
 ) -> tuple[SceneBounds, str]:
-    """Bounds from the cameras and what the file says, with a sentence on how they were found.
+    """Bounds, in scene units, from the cameras (at least one) and what the file says; a sentence on how they were found.
 
     - An explicit aabb is taken as it is.
     - Objects on a transparent background: a cube around the point all cameras look at, as large as their images reach
       there: half = 1.03 x distance x tan(half the field of view), 90th percentile over the cameras. NeRF-synthetic
       (distance 4.03, 0.691 rad) gives 1.495: the classical [-1.5, 1.5]^3.
-    - Photographs around a subject: the cube reaches to the median camera, its surroundings 16 times as far.
+    - Photographs around a subject: the cube reaches to the median camera, the background cube 16 times as far.
     - Forward-facing photographs with near/far: the cube holds what the cameras see between the two.
     - instant-ngp's aabb_scale is an upper bound on the region of detail.
     """
@@ -75,12 +62,11 @@ def estimate_bounds(
     if hint.aabb is not None:
         return bounds_of_box(hint.aabb, has_alpha), "scene bounds: the aabb of the file"
     positions = np.stack([camera.position for camera in cameras])
-    center, certainty = focus_point(cameras)
-    distances = np.linalg.norm(positions - center, axis=1)
-    ahead = np.array([(center - camera.position) @ camera.forward > 0 for camera in cameras])
-    if hint.near_far is not None and certainty < _FORWARD_FACING:
+    focus = focus_point(cameras)
+    distances = np.linalg.norm(positions - focus.point, axis=1)
+    if hint.near_far is not None and focus.certainty < _FORWARD_FACING:
         return _between(cameras, hint.near_far, has_alpha)
-    if len(cameras) < 2 or certainty < 1e-3 or ahead.mean() < 0.5 or distances.max() < 1e-9:
+    if len(cameras) < 2 or not focus.is_clear or distances.max() < 1e-9:
         return _guess(cameras, has_alpha)
     if has_alpha:
         reach = [d * _half_angle_tangent(camera) for d, camera in zip(distances, cameras, strict=True)]
@@ -90,7 +76,7 @@ def estimate_bounds(
     if hint.aabb_scale is not None:
         half = min(half, 0.5 * hint.aabb_scale / _INSTANT_NGP_SCALE)
     how = "the point all cameras look at, as far as " + ("their images reach" if has_alpha else "the median camera")
-    return _around(center, half, has_alpha), f"scene bounds: a cube of half side {half:.3f} around {how}"
+    return _around(focus.point, half, has_alpha), f"scene bounds: a cube of half side {half:.3f} around {how}"
 
 
 def _between(cameras: Sequence[Camera], near_far: tuple[float, float], has_alpha: bool) -> tuple[SceneBounds, str]:
@@ -126,8 +112,15 @@ def _guess(cameras: Sequence[Camera], has_alpha: bool) -> tuple[SceneBounds, str
 
 
 def require_seen(bounds: SceneBounds, cameras: Sequence[Camera]) -> None:
-    """Raises InputError unless at least one camera sees some of the bounds. Cameras inside them are fine."""
-    low, high = bounds.aabb if not bounds.is_unbounded else bounds.background_cube
+    """Refuses bounds of which no camera sees anything. Cameras inside them are fine.
+
+    Looked at: whether points of a grid in the bounds lie in an image or, for bounds narrower than the grid sees, rays of an
+    image meet them (slabs, Kay and Kajiya 1986).
+
+    Raises:
+        InputError: no camera sees any of the bounds.
+    """
+    low, high = bounds.aabb if bounds.background_cube is None else bounds.background_cube
     steps = np.linspace(0, 1, 9)
     grid = low + (high - low) * np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     for camera in cameras:

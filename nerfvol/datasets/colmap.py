@@ -7,34 +7,20 @@ the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
 from __future__ import annotations
 
 import itertools
-import struct
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras.calibration import Calibration
-from nerfvol.cameras.camera import rigid_pose
+from nerfvol.cameras.camera import FARTHEST, rigid_pose
+from nerfvol.cameras.lens import BrownConrady
+from nerfvol.datasets.colmap_files import images_file, points_file, read_cameras, read_images, read_points
 from nerfvol.datasets.listing import Frame, ImageFinder, Listing, hold_out
 from nerfvol.datasets.llff import image_folder
+from nerfvol.datasets.points import ModelPoints
 from nerfvol.errors import InputError
-from nerfvol.files.atomic import read_bytes
 
 _PLACES = ("sparse/0", "colmap/sparse/0", "sparse", ".")
-# COLMAP's model ids and their parameters in its order; f stands for both focal lengths, k for k1
-_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
-    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
-    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
-    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k1")),
-    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
-    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
-    "FULL_OPENCV": (6, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "rational4", "rational5", "rational6")),
-    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k1")),
-    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
-}
-_NAMES = {number: name for name, (number, _) in _MODELS.items()}
 _MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
 _AROUND = 1.25  # a lens's distortion may move a point by so much from where a pinhole would show it
 _FITTING = (
@@ -51,17 +37,20 @@ def find_model(folder: Path) -> Path | None:
     return None
 
 
-def read_colmap(folder: Path, split: str) -> Listing:
+def recognises(path: Path) -> bool:
+    """Whether the folder holds a COLMAP model."""
+    return find_model(path) is not None
+
+
+def read(folder: Path, split: str) -> Listing:
     """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken."""
     model = find_model(folder)
     if model is None:
         raise InputError(f"{folder}: expected a COLMAP model in sparse/0, but found none")
-    binary = (model / "cameras.bin").is_file() and (model / "images.bin").is_file()
-    source = model / ("images.bin" if binary else "images.txt")
-    calibrations = _binary_cameras(model / "cameras.bin") if binary else _text_cameras(model / "cameras.txt")
+    source, calibrations = images_file(model), read_cameras(model)
     finder = ImageFinder(image_folder(folder))
     frames, numbers = [], []
-    for number, name, quaternion, translation, camera in _binary_images(source) if binary else _text_images(source):
+    for number, name, quaternion, translation, camera in read_images(model):
         if camera not in calibrations:
             raise InputError(f"{source}, image {name}: its camera {camera} is not in the model's cameras")
         try:
@@ -76,21 +65,37 @@ def read_colmap(folder: Path, split: str) -> Listing:
     if not present:
         return Listing(frames, frames, source)
     chosen, training, sentence = hold_out(present, split)
-    doubt = _doubt(model, dict(zip(numbers, frames, strict=True)))
-    return Listing(chosen + missing, training, source, messages=[sentence, *doubt])
+    path = points_file(model)
+    listing = Listing(chosen + missing, training, source, messages=[sentence])
+    if path is not None:
+        listing.messages += _doubt(path, dict(zip(numbers, frames, strict=True)))
+        listing.read_points = lambda: model_points(path)
+    return listing
 
 
-def _doubt(model: Path, frames: dict[int, Frame]) -> list[str]:
+def model_points(path: Path) -> ModelPoints:
+    """The points of a points3D.bin or points3D.txt. Points that are nowhere (not finite, or beyond 1e15) are left out.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    rows = ((*point[:7], len(point.track)) for point in read_points(path))
+    table = np.fromiter(rows, dtype=np.dtype([*((name, "f8") for name in "xyz"), *((c, "u1") for c in "rgb"),
+                                              ("error", "f8"), ("track", "i8")]))  # fmt: skip
+    positions = np.stack([table[name] for name in "xyz"], axis=1)
+    there = (np.abs(positions) < FARTHEST).all(axis=1)
+    colours = np.stack([table[name] for name in "rgb"], axis=1)
+    return ModelPoints(positions[there], colours[there], table["track"][there], table["error"][there], str(path))
+
+
+def _doubt(path: Path, frames: dict[int, Frame]) -> list[str]:
     """A sentence where the model's points lie outside the images that it says show them; ``frames`` by image number."""
-    binary = model / "points3D.bin"
-    path = binary if binary.is_file() else model / "points3D.txt"
-    if not path.is_file() or any(frame.calibration.fisheye for frame in frames.values()):
+    if any(not isinstance(frame.calibration.lens, BrownConrady) for frame in frames.values()):
         return []
     shown: dict[int, list[tuple[float, ...]]] = {}
-    points = _binary_points(path) if path == binary else _text_points(path)
-    for place, track in itertools.islice(points, _MOST_POINTS):
-        for number in track:
-            shown.setdefault(number, []).append(place)
+    for point in itertools.islice(read_points(path), _MOST_POINTS):
+        for number in point.track:
+            shown.setdefault(number, []).append(point[:3])
     inside = total = 0
     for number, places in shown.items():
         if number not in frames:
@@ -127,149 +132,3 @@ def _pose(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> 
     ])  # fmt: skip
     position = -rotation.T @ translation
     return rigid_pose(np.concatenate([rotation.T * (1, -1, -1), position[:, None]], axis=1))
-
-
-def _calibration(model: str, width: int, height: int, parameters: tuple[float, ...]) -> Calibration:
-    values = dict(zip(_MODELS[model][1], parameters, strict=True))
-    rational = [name for name in ("rational4", "rational5", "rational6") if values.get(name)]
-    if rational:
-        raise InputError("the rational terms k4, k5, k6 of FULL_OPENCV are not supported; export undistorted images")
-    if not all(np.isfinite(parameters)) or min(width, height) < 1:
-        raise InputError(f"a camera must have a size and finite parameters, got {width}x{height} and {parameters}")
-    focal = values.get("f")
-
-    def get(key: str) -> float:
-        return values.get(key, 0.0)
-
-    return Calibration(
-        width=width,
-        height=height,
-        fx=values.get("fx", focal),
-        fy=values.get("fy", focal),
-        cx=values["cx"],
-        cy=values["cy"],
-        distortion=(get("k1"), get("k2"), get("k3"), get("k4"), get("p1"), get("p2")),
-        fisheye="FISHEYE" in model,
-        resizable=True,
-    )
-
-
-class _Cursor:
-    """Reads little-endian values and refuses to run past the end."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, read_bytes(path), 0
-
-    def take(self, layout: str) -> tuple:
-        size = struct.calcsize("<" + layout)
-        self.require(size)
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += size
-        return values
-
-    def require(self, size: int) -> None:
-        if self.at + size > len(self.data):
-            raise InputError(f"{self.path}: the file is truncated, or no COLMAP model ({len(self.data)} bytes)")
-
-    def name(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise InputError(f"{self.path}: the file is truncated: an image name has no end")
-        raw, self.at = self.data[self.at : end], end + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise InputError(f"{self.path}: expected an image name, got bytes that are no text") from None
-
-
-def _binary_cameras(path: Path) -> dict[int, Calibration]:
-    cursor = _Cursor(path)
-    found = {}
-    for _ in range(cursor.take("Q")[0]):
-        camera, number, width, height = cursor.take("iiQQ")
-        if number not in _NAMES:
-            known = ", ".join(_MODELS)
-            raise InputError(f"{path}, camera {camera}: lens model {number} is not supported; known models: {known}")
-        model = _NAMES[number]
-        found[camera] = _checked(path, camera, model, width, height, cursor.take(f"{len(_MODELS[model][1])}d"))
-    return found
-
-
-def _text_cameras(path: Path) -> dict[int, Calibration]:
-    found = {}
-    for line in _lines(path):
-        if not line:
-            continue
-        try:
-            camera, model, width, height, *parameters = line.split()
-            numbers = int(camera), int(width), int(height), tuple(map(float, parameters))
-        except ValueError:
-            raise InputError(f"{path}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line!r:.60}") from None
-        if model not in _MODELS or len(numbers[3]) != len(_MODELS[model][1]):
-            raise InputError(f"{path}, camera {camera}: unknown lens model or wrong number of parameters: {line!r:.60}")
-        found[numbers[0]] = _checked(path, numbers[0], model, *numbers[1:])
-    return found
-
-
-def _checked(path: Path, camera: int, model: str, width: int, height: int, parameters: tuple) -> Calibration:
-    try:
-        return _calibration(model, width, height, parameters)
-    except InputError as error:
-        raise InputError(f"{path}, camera {camera}: {error}") from None
-
-
-_Image = tuple[int, str, NDArray[np.float64], NDArray[np.float64], int]  # number, name, quaternion, translation, camera
-_Point = tuple[tuple[float, ...], Sequence[int]]  # place, numbers of the images that show it
-
-
-def _binary_images(path: Path) -> Iterator[_Image]:
-    cursor = _Cursor(path)
-    for _ in range(cursor.take("Q")[0]):
-        values = cursor.take("i7di")
-        name = cursor.name()
-        observations = 24 * cursor.take("Q")[0]  # (x, y, point id) of every feature
-        cursor.require(observations)
-        cursor.at += observations
-        yield values[0], name, np.array(values[1:5]), np.array(values[5:8]), values[8]
-
-
-def _text_images(path: Path) -> Iterator[_Image]:
-    for line in list(_lines(path))[::2]:  # every second line lists the features of the image above it
-        if not line:
-            continue
-        try:
-            number, *numbers, camera, name = line.split(maxsplit=9)
-            values = [float(v) for v in numbers]
-            if len(values) != 7:
-                raise ValueError
-            yield int(number), name, np.array(values[:4]), np.array(values[4:]), int(camera)
-        except ValueError:
-            fields = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            raise InputError(f"{path}: expected {fields}, got {line!r:.60}") from None
-
-
-def _binary_points(path: Path) -> Iterator[_Point]:
-    cursor = _Cursor(path)
-    for _ in range(cursor.take("Q")[0]):
-        _, x, y, z, *_, length = cursor.take("Q3d3BdQ")
-        cursor.require(8 * length)
-        yield (x, y, z), cursor.take(f"{2 * length}i")[::2]
-
-
-def _text_points(path: Path) -> Iterator[_Point]:
-    for line in filter(None, _lines(path)):
-        try:
-            _, x, y, z, _, _, _, _, *track = line.split()
-            yield (float(x), float(y), float(z)), list(map(int, track[::2]))
-        except ValueError:
-            fields = "POINT3D_ID X Y Z R G B ERROR TRACK"
-            raise InputError(f"{path}: expected {fields}, got {line!r:.60}") from None
-
-
-def _lines(path: Path) -> Iterator[str]:
-    """The lines without comments. Empty ones stay: an image without features has an empty second line."""
-    try:
-        text = read_bytes(path).decode("utf-8")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected the text of a COLMAP model, got bytes that are no text") from None
-    return (line.strip() for line in text.splitlines() if not line.startswith("#"))

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads
+from nerfvol.datasets.points import ModelPoints
+from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
+
+Made = TypeVar("Made")
 
 NEAR_SHARE = 0.1
 """Of the median distance between cameras and the scene's middle: what counts as right before a lens."""
@@ -21,41 +27,51 @@ NEAR_SHARE = 0.1
 class Dataset:
     """Posed images of one split.
 
-    ``images``: uint8 arrays, (h, w, 3) or (h, w, 4) with straight alpha, as large as their camera's intrinsics say.
+    ``images``: uint8 arrays, (h, w, 3) or (h, w, 4) with straight alpha, as large as their camera's intrinsics say; an
+    ImageStore where they came from files.
     ``names``: one a view, unique, fit for a file name. ``source``: the file the poses came from.
     ``messages``: sentences a person should see (frames left out, how the split was made, how the bounds were found).
-    ``reload``: reads the images again after :meth:`release`; None where they came from no file (a dataset made with
-    dataclasses.replace has none either).
+    ``threads``: that decode and average; one for every core by default. ``read_points``: see :attr:`points`.
+
+    dataclasses.replace makes a dataset of other cameras, images, bounds; what is not replaced is shared, the store of images
+    too.
     """
 
     cameras: list[Camera]
-    images: list[UInt8]
+    images: Sequence[UInt8]
     names: list[str]
     scene: SceneBounds
     source: str
     messages: list[str] = field(default_factory=list)
     threads: int | None = None
-    reload: Callable[[], list[UInt8]] | None = field(default=None, init=False)
+    read_points: Callable[[], ModelPoints] | None = None
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     @property
     def nbytes(self) -> int:
-        """Bytes the images hold; 0 where they were let go."""
-        return sum(image.nbytes for image in vars(self).get("images", ()))
+        """Bytes the images hold; 0 while they are released."""
+        return self.images.nbytes if isinstance(self.images, ImageStore) else sum(i.nbytes for i in self.images)
+
+    @property
+    def can_reload(self) -> bool:
+        """Whether the images came from files, so that :meth:`release` does something."""
+        return isinstance(self.images, ImageStore)
+
+    @functools.cached_property
+    def points(self) -> ModelPoints | None:
+        """The points that were found with the poses, read when first asked for; None where the format has none.
+
+        Raises:
+            InputError: their file is damaged.
+        """
+        return None if self.read_points is None else self.read_points()
 
     def release(self) -> None:
-        """Let the images' memory go, where they can be read again: whoever asks for ``images`` next does so."""
-        if self.reload is not None:
-            self.__dict__.pop("images", None)
-
-    def __getattr__(self, name: str) -> list[UInt8]:
-        reload = self.__dict__.get("reload")
-        if name != "images" or reload is None:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        self.images = reload()
-        return self.images
+        """Give up the images' memory, where they can be read again: whoever asks for one of them next does so."""
+        if isinstance(self.images, ImageStore):
+            self.images.release()
 
     def evenly(self, most: int) -> Dataset:
         """At most ``most`` of the views, evenly chosen, the first and the last among them; the same images."""
@@ -66,7 +82,7 @@ class Dataset:
         return replace(self, cameras=cameras, images=images, names=names)
 
     def smaller(self, k: int, background: Sequence[float]) -> Dataset:
-        """All views area-averaged over k x k pixels, over a background (3,) in [0, 1]."""
+        """All views area-averaged over k x k pixels, over a background (3,) in [0, 1]; InputError where nothing is left."""
         cameras = [camera.scaled(k) for camera in self.cameras]
         return replace(self, cameras=cameras, images=self.pyramid(background, k))
 
@@ -82,8 +98,11 @@ class Dataset:
         return replace(self, cameras=cameras, images=images)
 
     def before_a_lens(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which points (n, 3) are right before a camera, (n,): what is there is seen by no other and would only explain
-        that one picture. None in scenes without surroundings, whose cameras stand outside."""
+        """Which points (n, 3) are right before a camera, (n,) bool: what is there is seen by no other and would only explain
+        that one picture. None in scenes without a background of their own, whose cameras are outside.
+
+        ``points`` are in scene units; right before is within NEAR_SHARE of the cameras' median distance to the middle.
+        """
         hidden = np.zeros(len(points), dtype=bool)
         if not self.scene.is_unbounded:
             return hidden
@@ -97,14 +116,23 @@ class Dataset:
         """Image i over a background (3,) in [0, 1]: float32 (h, w, 3) in [0, 1]."""
         return composite(self.images[i], background)
 
+    @overload
+    def pyramid(self, background: Sequence[float], k: int) -> list[UInt8]: ...
+    @overload
+    def pyramid(self, background: Sequence[float], k: int, then: Callable[[UInt8], Made]) -> list[Made]: ...
     def pyramid(
-        self, background: Sequence[float], k: int, then: Callable[[UInt8], UInt8] = lambda image: image
-    ) -> list[UInt8]:
+        self, background: Sequence[float], k: int, then: Callable[[UInt8], Made] | None = None
+    ) -> list[UInt8] | list[Made]:
         """Every image over a background (3,) in [0, 1], area-averaged over k x k pixels: uint8 (h // k, w // k, 3).
 
         Their cameras are ``camera.scaled(k)``. Opaque images at k = 1 are returned themselves, not copied. ``then`` turns
-        each image into what is kept of it, so that the whole level never stands beside that.
+        each image into what is kept of it, so that the whole level is never in memory at once.
+
+        Raises:
+            InputError: k is not between 1 and 256.
         """
         if not 1 <= k <= 256:
             raise InputError(f"the pyramid's factor must be an integer between 1 and 256, got {k}")
+        if then is None:
+            return map_threads(lambda image: composite_average(image, background, k), self.images, self.threads)
         return map_threads(lambda image: then(composite_average(image, background, k)), self.images, self.threads)

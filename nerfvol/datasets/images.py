@@ -6,7 +6,6 @@ colour premultiplied by alpha, summed exactly in integers and rounded once.
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Sequence
@@ -20,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
+from nerfvol.machine import usable_cores
 
 UInt8 = NDArray[np.uint8]
 Item = TypeVar("Item")
@@ -31,16 +31,12 @@ _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 _DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error, MemoryError)
 
 
-def worker_count(threads: int | None = None) -> int:
-    """The number of worker threads: as asked, or one for every core this process may use."""
-    if threads is not None:
-        return max(1, threads)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def map_threads(function: Callable[[Item], Made], items: Iterable[Item], threads: int | None = None) -> list[Made]:
-    """``function`` of every item, in order, in threads (decoding and numpy's loops let others run)."""
-    with ThreadPoolExecutor(worker_count(threads)) as pool:
+    """``function`` of every item, in order, in threads (decoding and numpy's loops let others run).
+
+    ``threads``: how many; None: one for every core this process may use.
+    """
+    with ThreadPoolExecutor(usable_cores() if threads is None else max(1, threads)) as pool:
         return list(pool.map(function, items))
 
 
@@ -67,7 +63,7 @@ def _open(path: Path) -> Image.Image:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels from the file's header alone."""
+    """(width, height) in pixels from the file's header alone; InputError where it is no image, damaged or too large."""
     with _open(path) as image:
         return image.size
 
@@ -76,6 +72,9 @@ def read_image(path: Path) -> UInt8:
     """The image as uint8: (h, w, 4) where the file has transparency, else (h, w, 3); grey and palettes are expanded.
 
     16-bit channels are reduced to 8. EXIF orientation is not applied: poses refer to pixels as stored.
+
+    Raises:
+        InputError: there is no such image, it is damaged, has 32 bits a channel or more than MAX_PIXELS.
     """
     with _open(path) as image:
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.images import SUFFIXES
+from nerfvol.datasets.points import ModelPoints
 from nerfvol.errors import InputError
 
 HOLD_OUT_EVERY = 8
@@ -36,13 +37,18 @@ class Frame:
 
 @dataclass(eq=False)
 class Listing:
-    """The frames of one split, and of the training split (from which the scene bounds are worked out)."""
+    """The frames of one split, and of the training split (from which the scene bounds are worked out).
+
+    ``source``: the file the poses came from. ``messages``: sentences a person should see. ``read_points``: reads the points
+    found with the poses; None where the format has none.
+    """
 
     frames: list[Frame]
     training: list[Frame]
     source: Path
     hint: BoundsHint = field(default_factory=BoundsHint)
     messages: list[str] = field(default_factory=list)
+    read_points: Callable[[], ModelPoints] | None = None
 
 
 def hold_out(frames: list[Frame], split: str) -> tuple[list[Frame], list[Frame], str]:

@@ -30,12 +30,12 @@ _LOAD_ERRORS = (
 )  # fmt: skip
 
 
-def is_llff_folder(folder: Path) -> bool:
+def recognises(path: Path) -> bool:
     """Whether the folder holds LLFF poses."""
-    return (folder / POSES).is_file()
+    return (path / POSES).is_file()
 
 
-def read_llff(folder: Path, split: str) -> Listing:
+def read(folder: Path, split: str) -> Listing:
     """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken."""
     path = folder / POSES
     rows = _load_rows(path)

@@ -7,37 +7,35 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.bounds import bounds_of_box, estimate_bounds, require_seen
-from nerfvol.datasets.colmap import find_model, read_colmap
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.formats import SPLITS, find_format
 from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
 from nerfvol.datasets.listing import Frame, Listing, listed_names
-from nerfvol.datasets.llff import is_llff_folder, read_llff
-from nerfvol.datasets.transforms import is_transforms_folder, read_transforms
+from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError
+from nerfvol.machine import total_memory
 from nerfvol.region import SceneBounds, check_box
-
-SPLITS = ("train", "val", "test")
 
 
 def load_dataset(
     path: str | os.PathLike[str],
     split: str = "train",
     downscale: int = 1,
-    scene_override: SceneBounds | ArrayLike | None = None,
+    aabb: ArrayLike | None = None,
     threads: int | None = None,
 ) -> Dataset:
     """Loads one split of a folder of posed images, whatever its format (docs/data.md).
 
     Args:
-        path: a folder with transforms*.json, LLFF poses or a COLMAP model, and images; or one transforms*.json.
+        path: a folder that one of FORMATS recognises, or one transforms*.json.
         split: "train", "val" or "test".
         downscale: area-averages the images (premultiplied by alpha) over downscale x downscale pixels.
-        scene_override: bounds to use instead of those worked out: a SceneBounds, or the region of detail as six numbers
-            (x0, y0, z0, x1, y1, z1) or (2, 3).
+        aabb: the region of detail (see SceneBounds) instead of the one worked out: x0, y0, z0, x1, y1, z1 or its two
+            corners (2, 3), in scene units.
         threads: threads that decode; one for every core by default.
 
     Raises:
@@ -47,7 +45,8 @@ def load_dataset(
         raise InputError(f"the split must be one of {', '.join(SPLITS)}, got {split!r}")
     if not isinstance(downscale, int) or not 1 <= downscale <= 256:
         raise InputError(f"downscale must be an integer between 1 and 256, got {downscale!r}")
-    listing = _read_listing(Path(path), split)
+    box = None if aabb is None else check_box(aabb, "aabb")
+    listing = find_format(Path(path)).reader.read(Path(path), split)
     messages = list(listing.messages)
     frames = _present(listing, messages)
     sizes = map_threads(lambda frame: image_size(frame.file), frames, threads)
@@ -65,27 +64,12 @@ def load_dataset(
 
     images, has_alpha = decode()
     training = [f for f in listing.training if f.path is not None] or frames
-    scene, sentence = _bounds(listing, training, scene_override, has_alpha)
+    scene, sentence = _bounds(listing, training, box, has_alpha)
     require_seen(scene, cameras)
     messages.append(sentence)
-    dataset = Dataset(cameras, images, listed_names(frames), scene, str(listing.source), messages, threads)
-    dataset.reload = lambda: decode()[0]
-    return dataset
-
-
-def _read_listing(path: Path, split: str) -> Listing:
-    if not path.exists():
-        raise InputError(f"{path}: expected a folder with posed images, but there is no such folder")
-    if path.is_file() or is_transforms_folder(path):
-        return read_transforms(path, split)
-    if is_llff_folder(path):
-        return read_llff(path, split)
-    if find_model(path) is not None:
-        return read_colmap(path, split)
-    raise InputError(
-        f"{path}: expected posed images, but found no transforms.json or transforms_train.json, no poses_bounds.npy "
-        "and no COLMAP model in sparse/0"
-    )
+    store = ImageStore(len(images), lambda: decode()[0], images)
+    names, source = listed_names(frames), str(listing.source)
+    return Dataset(cameras, store, names, scene, source, messages, threads, listing.read_points)
 
 
 def _present(listing: Listing, messages: list[str]) -> list[Frame]:
@@ -129,16 +113,13 @@ def _require_one_size(frames: Sequence[Frame], sizes: Sequence[tuple[int, int]])
 
 
 def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
-    """Refuses a set of images that cannot fit in the machine's memory before any of it is decoded."""
+    """Refuses a set of images that cannot fit in memory (the machine's, or its container's limit) before decoding any."""
     need = sum(4 * camera.intrinsics.width * camera.intrinsics.height for camera in cameras)
-    try:
-        have = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # a platform that does not tell; decode and see
-        return
-    if need > 0.8 * have:
+    have = total_memory()
+    if have is not None and need > 0.8 * have:  # on a platform that does not tell, decode and see
         factor = int(np.ceil(downscale * np.sqrt(need / (0.5 * have))))
         raise InputError(
-            f"{len(cameras)} images need {need / 2**30:.1f} GiB and this machine has {have / 2**30:.1f} GiB of memory; "
+            f"{len(cameras)} images need {need / 2**30:.1f} GiB and there are {have / 2**30:.1f} GiB of memory; "
             f"use a downscale of {factor} or more"
         )
 
@@ -154,11 +135,9 @@ def _settle_alpha(images: list[UInt8], source: Path) -> tuple[list[UInt8], bool]
 
 
 def _bounds(
-    listing: Listing, training: list[Frame], override: SceneBounds | ArrayLike | None, has_alpha: bool
+    listing: Listing, training: list[Frame], box: NDArray[np.float64] | None, has_alpha: bool
 ) -> tuple[SceneBounds, str]:
-    if isinstance(override, SceneBounds):
-        return override, "scene bounds: as given"
-    if override is not None:
-        return bounds_of_box(check_box(override, "the scene's aabb"), has_alpha), "scene bounds: the aabb as given"
+    if box is not None:
+        return bounds_of_box(box, has_alpha), "scene bounds: the aabb as given"
     cameras = [_camera(frame, image_size(frame.file), listing.source) for frame in training]
     return estimate_bounds(cameras, has_alpha, listing.hint)

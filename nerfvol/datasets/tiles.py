@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfvol.cameras.camera import tile_pixels
+from nerfvol.cameras.camera import Intrinsics, tile_pixels
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.kernels.state import TILE_RAYS, Batch
 from nerfvol.native import native
@@ -15,7 +15,7 @@ from nerfvol.native import native
 
 @dataclass
 class Cursor:
-    """Where one of the two shuffled queues stands: position inside an epoch's permutation."""
+    """How far one of the two shuffled queues is: position inside an epoch's permutation."""
 
     epoch: int = 0
     position: int = 0
@@ -37,7 +37,7 @@ class TileBank:
         self.origins = np.stack([c.c2w[:3, 3] for c in cameras]).astype(np.float32)
         self.rotations = np.stack([c.c2w[:3, :3] for c in cameras]).astype(np.float32)
         self.pixel_angle = float(np.median([1 / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras]))
-        tables: dict = {}  # camera-space directions in tile order, per distinct intrinsics
+        tables: dict[Intrinsics, np.ndarray] = {}  # camera-space directions in tile order, per distinct intrinsics
         self._directions: list[np.ndarray] = []
         insides, image_of, tile_of = [], [], []
         for i, camera in enumerate(cameras):
@@ -60,10 +60,12 @@ class TileBank:
 
     @property
     def n_tiles(self) -> int:
+        """Tiles of all images."""
         return len(self.image)
 
     @property
     def n_rays(self) -> int:
+        """Rays of all tiles, padding included."""
         return self.n_tiles * TILE_RAYS
 
     def draw(self, n: int, rich_share: float, seed: int, rich: Cursor, plain: Cursor) -> Batch:
@@ -138,7 +140,7 @@ def _next(tiles: np.ndarray, cursor: Cursor, count: int, seed: list[int]) -> np.
     return np.concatenate(out)
 
 
-_cached: dict[tuple, np.ndarray] = {}
+_cached: dict[tuple[int, ...], np.ndarray] = {}
 
 
 def _permutation(n: int, seed: tuple[int, ...]) -> np.ndarray:

@@ -10,33 +10,31 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from nerfvol.cameras.calibration import finite_number, read_calibration, read_matrix
 from nerfvol.cameras.camera import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
+from nerfvol.datasets.formats import SPLITS
 from nerfvol.datasets.listing import Frame, ImageFinder, Listing, hold_out
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json
 from nerfvol.region import check_box
 
-_SPLITS = ("train", "val", "test")
+
+def recognises(path: Path) -> bool:
+    """Whether the folder holds a transforms*.json this module reads, or is such a file itself."""
+    names = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
+    return path.is_file() or any((path / name).is_file() for name in names)
 
 
-def is_transforms_folder(folder: Path) -> bool:
-    """Whether the folder holds a transforms*.json this module reads."""
-    return any((folder / name).is_file() for name in ("transforms.json", *(f"transforms_{s}.json" for s in _SPLITS)))
-
-
-def read_transforms(path: Path, split: str) -> Listing:
+def read(path: Path, split: str) -> Listing:
     """The listing of one split of a folder with transforms*.json, or of one such file.
 
-    transforms_{train,val,test}.json are used as they are; where only one of val and test exists it stands for both. A
+    transforms_{train,val,test}.json are used as they are; where only one of val and test exists it is used for both. A
     single transforms.json is split by its own train/val/test_filenames or, without them, by holding out every 8th view.
     """
     if path.is_file():
         return _read_single(path, split)
-    files = {s: path / f"transforms_{s}.json" for s in _SPLITS if (path / f"transforms_{s}.json").is_file()}
+    files = {s: path / f"transforms_{s}.json" for s in SPLITS if (path / f"transforms_{s}.json").is_file()}
     if not files:
         return _read_single(path / "transforms.json", split)
     if "val" not in files and "test" not in files:
@@ -74,7 +72,7 @@ def _read_single(path: Path, split: str) -> Listing:
 def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
     """nerfstudio's train_filenames, val_filenames and test_filenames, those that are there."""
     named = {}
-    for split in _SPLITS:
+    for split in SPLITS:
         names = data.get(f"{split}_filenames")
         if not names:
             continue
@@ -128,13 +126,8 @@ def _parse(data: Mapping[str, Any], path: Path) -> tuple[list[Frame], BoundsHint
 
 def _hint(data: Mapping[str, Any]) -> BoundsHint:
     aabb = data.get("aabb")
-    if aabb is not None:
-        try:
-            aabb = np.array(aabb, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise InputError(f"aabb must be two corners of three numbers, got {aabb!r:.60}") from None
-        aabb = check_box(aabb, "aabb")
+    box = None if aabb is None else check_box(aabb, "aabb")
     scale = finite_number(data, "aabb_scale")
     if scale is not None and scale <= 0:
         raise InputError(f"aabb_scale must be positive, got {scale:g}")
-    return BoundsHint(aabb=aabb, aabb_scale=scale)
+    return BoundsHint(aabb=box, aabb_scale=scale)

@@ -203,3 +203,17 @@ def side_by_side(panels: list[Float], gap: int = 8) -> Float:
     white = np.ones((coloured[0].shape[0], gap, 3), np.float32)
     pieces = [piece for panel in coloured for piece in (panel, white)]
     return np.concatenate(pieces[:-1], axis=1)
+
+
+def stacked(strips: list[NDArray[np.uint8]], gap: int = 8) -> NDArray[np.uint8]:
+    """Pictures of one width below each other, with white between them."""
+    white = np.full((gap, *strips[0].shape[1:]), 255, np.uint8)
+    return np.concatenate([piece for strip in strips for piece in (strip, white)][:-1])
+
+
+def read_png(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+    """An RGB picture (H, W, 3) that this program wrote."""
+    from PIL import Image
+
+    with Image.open(path, formats=("PNG",)) as image:
+        return np.asarray(image.convert("RGB"))

@@ -1,4 +1,4 @@
-"""The run folder: what lies where, what a RUN|FILE argument means, and how an earlier run in the way is kept."""
+"""The run folder: what lies where, and which file a RUN|FILE argument means."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from nerfvol.errors import InputError
 
 CONFIG = "config.yaml"
 OCTREE = "octree.safetensors"
+PRODUCTS = (OCTREE,)
+"""Models that a finished run may hold."""
 CHECKPOINT = "checkpoint.safetensors"
 DISTILLED = "distilled.safetensors"
 METRICS = "metrics.json"
@@ -17,14 +19,16 @@ PREVIEWS = "previews"
 PREVIOUS = "previous"
 
 
-def octree_path(target: str | os.PathLike[str]) -> Path:
-    """The octree file that RUN|FILE means; a missing one is an InputError that says what was looked for."""
+def model_path(target: str | os.PathLike[str]) -> Path:
+    """The file of the model that RUN|FILE means; a missing one is an InputError that says what was looked for."""
     path = Path(target)
     if path.is_dir():
-        found = path / OCTREE
-        if not found.is_file():
-            raise InputError(f"{path} holds no {OCTREE}: it is no finished run folder")
-        return found
+        for name in PRODUCTS:
+            if (path / name).is_file():
+                return path / name
+        if not (path / CONFIG).is_file():
+            raise InputError(f"{path} is no run folder: it holds neither {' nor '.join((*PRODUCTS, CONFIG))}")
+        raise InputError(f"{path} holds no {' or '.join(PRODUCTS)}: it is no finished run folder")
     if not path.exists():
-        raise InputError(f"no such run folder or octree file: {path}")
+        raise InputError(f"no such run folder or model file: {path}")
     return path

@@ -14,8 +14,17 @@ from torch import Tensor
 from nerfvol.defaults import WHITE
 from nerfvol.kernels import reference
 from nerfvol.kernels.checks import check_background, check_batch, check_early_stop, check_rays
-from nerfvol.kernels.state import OUTPUTS, TILE_RAYS, Batch, LossOptions, Rates, StepReport, TrainState
-from nerfvol.kernels.tree import kernel_tree
+from nerfvol.kernels.state import (
+    OUTPUTS,
+    TILE_RAYS,
+    Batch,
+    LeafStatistics,
+    LossOptions,
+    Rates,
+    StepReport,
+    TrainState,
+)
+from nerfvol.kernels.tree import kernel_batch, kernel_options, kernel_tree
 from nerfvol.native import native
 from nerfvol.octree import lod
 from nerfvol.octree.tree import Octree
@@ -110,17 +119,13 @@ def render_values(
 
 def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOptions) -> Tensor:
     """Gradient of the training loss in ``values`` (n_vertices, row); float64 on the reference, float32 compiled."""
-    o, d, bg, eps = check_batch(batch, options)
+    o, d, _, _ = check_batch(batch, options)
     if values.dtype == torch.float32 and (compiled := native()) is not None:
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
         tree = kernel_tree(octree, values.detach().contiguous().numpy())
-        smooth = (float(options.smooth_density), float(options.smooth_colour))
-        loss = (bg, eps, float(options.colour), float(options.distortion), *smooth, 1.0)
-        no_optimiser = (None, None, [0.0, 0.0, 0.0], 0.0, 0.0)
-        no_statistics = (None, None, None)
-        compiled.train_step(
-            tree, o, d, batch.target, batch.weight, *loss, gradient.numpy(), *no_optimiser, slots, *no_statistics
+        compiled.loss_gradient(
+            tree, kernel_batch(o, d, batch), kernel_options(options), gradient=gradient.numpy(), slots=slots
         )
         return gradient
     leaf = values.detach().clone().requires_grad_()
@@ -147,23 +152,36 @@ def train_step(
     leaf = values.clone().requires_grad_()
     total, report = _reference_loss(octree, leaf, batch, options)
     gradient = torch.autograd.grad(total, leaf)[0]
-    samples: reference.Samples = report["samples"]
-    seg = samples.segments
     with torch.no_grad():
-        touched = torch.from_numpy(octree.corners).long()[seg.leaf].flatten().unique()
+        leaves = report["samples"].segments.leaf
+        touched = torch.from_numpy(octree.corners).long()[leaves].flatten().unique()
         g, moments = gradient[touched], torch.from_numpy(state.moments)
         old = moments[touched]
         new = torch.where(old > 0, rates.beta * old + (1 - rates.beta) * g * g, g * g)
         moments[touched] = new
         values[touched] -= _rate_row(octree, rates) * g / (new.sqrt() + rates.eps)
+    return _add_statistics(octree, batch, report, pixel_angle, state)
 
-        weight = torch.from_numpy(batch.weight)[report["live"]]
-        max_weight, footprint = torch.from_numpy(state.max_weight), torch.from_numpy(state.footprint)
-        max_weight.scatter_reduce_(0, seg.leaf, samples.weights.detach(), "amax")
-        error = samples.weights.detach() * (weight * report["squared_error"])[seg.ray]
-        torch.from_numpy(state.error).index_add_(0, seg.leaf, error)
-        side = torch.from_numpy(octree.leaf_sizes()).float()[seg.leaf]
-        footprint.scatter_reduce_(0, seg.leaf, side / (samples.middle.clamp_min(1e-6) * pixel_angle), "amax")
+
+def leaf_statistics(
+    octree: Octree, batch: Batch, options: LossOptions, pixel_angle: float, into: LeafStatistics
+) -> StepReport:
+    """ops.leaf_statistics on the reference, with arguments that were checked there."""
+    with torch.no_grad():
+        _, report = _reference_loss(octree, torch.from_numpy(octree.values), batch, options)
+    return _add_statistics(octree, batch, report, pixel_angle, into)
+
+
+@torch.no_grad()
+def _add_statistics(octree: Octree, batch: Batch, report: dict, pixel_angle: float, into: LeafStatistics) -> StepReport:
+    samples: reference.Samples = report["samples"]
+    seg, weight = samples.segments, torch.from_numpy(batch.weight)[report["live"]]
+    max_weight, footprint = torch.from_numpy(into.max_weight), torch.from_numpy(into.footprint)
+    max_weight.scatter_reduce_(0, seg.leaf, samples.weights.detach(), "amax")
+    error = samples.weights.detach() * (weight * report["squared_error"])[seg.ray]
+    torch.from_numpy(into.error).index_add_(0, seg.leaf, error)
+    side = torch.from_numpy(octree.leaf_sizes()).float()[seg.leaf]
+    footprint.scatter_reduce_(0, seg.leaf, side / (samples.middle.clamp_min(1e-6) * pixel_angle), "amax")
     squared = float((weight * report["squared_error"]).sum())
     return StepReport(squared / max(3 * float(weight.sum()), 1e-30), len(seg.ray) / max(len(batch.rays_d), 1))
 

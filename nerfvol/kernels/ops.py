@@ -27,6 +27,7 @@ from nerfvol.kernels.state import (
     SQUARE,
     TILE_RAYS,
     Batch,
+    LeafStatistics,
     LossOptions,
     Rates,
     StepReport,
@@ -34,17 +35,23 @@ from nerfvol.kernels.state import (
     View,
     from_squares,
 )
-from nerfvol.kernels.threads import available_isas, get_threads, isa, set_isa, set_threads
-from nerfvol.kernels.tree import kernel_tree
+from nerfvol.kernels.threads import (
+    arena_bytes,
+    available_isas,
+    get_threads,
+    isa,
+    release_arenas,
+    set_isa,
+    set_threads,
+)
+from nerfvol.kernels.tree import kernel_batch, kernel_options, kernel_statistics, kernel_tree
 from nerfvol.native import native
 from nerfvol.octree.tree import Octree
 
-# ------------------------------------------------------------------ which code runs
-
-
 __all__ = [
-    "OUTPUTS", "TILE_RAYS", "Batch", "LossOptions", "Rates", "StepReport", "TrainState", "View", "available_isas",
-    "get_threads", "isa", "render_rays", "render_view", "set_isa", "set_threads", "train_step",
+    "OUTPUTS", "TILE_RAYS", "Batch", "LeafStatistics", "LossOptions", "Rates", "StepReport", "TrainState", "View",
+    "arena_bytes", "available_isas", "get_threads", "isa", "leaf_statistics", "release_arenas", "render_rays",
+    "render_view", "set_isa", "set_threads", "train_step",
 ]  # fmt: skip
 
 
@@ -72,7 +79,8 @@ def render_rays(
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
     by less than that; 0 is exact. A node whose side is below ``coarse`` times the distance of its centre from the ray's
-    origin stands in for its leaves (nerfvol.lod); 0: none does.
+    origin stands in for its leaves (nerfvol.octree.lod); 0: none does. Raises ValueError where rays, background,
+    threshold, outputs or coarse are not what they should be.
     """
     o, d = check_rays(rays_o, rays_d)
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
@@ -94,7 +102,10 @@ def render_view(
     outputs: Sequence[str] = OUTPUTS,
     coarse: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Renders a camera's picture; results as in :func:`render_rays`, (height, width[, 3])."""
+    """Renders a camera's picture; results as in :func:`render_rays`, (height, width[, 3]).
+
+    Raises ValueError where the view is no float32 array of squares or not finite, and as render_rays does.
+    """
     directions, camera_to_world, height, width = view.directions, view.camera_to_world, view.height, view.width
     squares = (-(-height // SQUARE), -(-width // SQUARE), 4, 3, TILE_RAYS)
     if directions.shape != squares or directions.dtype != np.float32 or not directions.flags.c_contiguous:
@@ -135,37 +146,50 @@ def _finished(out: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def train_step(
     octree: Octree, state: TrainState, batch: Batch, options: LossOptions, rates: Rates, pixel_angle: float
 ) -> StepReport:
-    """One optimiser step on ``octree.values`` in place. pixel_angle: angle between neighbouring rays, radians.
+    """One step of the optimiser on the loss over ``batch``; changes ``octree.values`` and ``state`` in place.
 
-    Bitwise the same for any number of threads.
+    pixel_angle: angle between neighbouring rays, radians. Bitwise the same for any number of threads. Raises ValueError
+    where rays, targets, weights, options or state do not fit each other or the octree.
     """
-    o, d, bg, eps = check_batch(batch, options)
+    o, d, _, _ = check_batch(batch, options)
     state.check(octree)
     octree.averages = None
     if (compiled := native()) is None:
         return _on_torch().train_step(octree, state, batch, options, rates, pixel_angle)
-    squared, weight, samples = compiled.train_step(
+    report = compiled.train_step(
         kernel_tree(octree, octree.values),
-        o,
-        d,
-        batch.target,
-        batch.weight,
-        bg,
-        eps,
-        float(options.colour),
-        float(options.distortion),
-        float(options.smooth_density),
-        float(options.smooth_colour),
-        float(pixel_angle),
-        None,
-        octree.values,
-        state.moments,
-        [rates.density, rates.dc, rates.sh],
-        rates.beta,
-        rates.eps,
-        state.slots,
-        state.max_weight,
-        state.error,
-        state.footprint,
+        kernel_batch(o, d, batch),
+        kernel_options(options),
+        kernel_options(rates),
+        values=octree.values,
+        moments=state.moments,
+        slots=state.slots,
+        statistics=kernel_statistics(state, pixel_angle),
     )
-    return StepReport(squared / max(3 * weight, 1e-30), samples / max(len(d), 1))
+    return _step_report(report, len(d))
+
+
+def leaf_statistics(
+    octree: Octree, batch: Batch, options: LossOptions, pixel_angle: float, into: LeafStatistics
+) -> StepReport:
+    """What the rays of ``batch`` say of the leaves: bit by bit the statistics of :func:`train_step`, with nothing moved.
+
+    ``into`` is updated in place, so that batches add up; it may be a TrainState, whose moments stay. Of the options,
+    background and early_stop_eps count. pixel_angle: as in train_step; so are the errors.
+    """
+    o, d, _, _ = check_batch(batch, options)
+    LeafStatistics.check(into, octree)
+    if (compiled := native()) is None:
+        return _on_torch().leaf_statistics(octree, batch, options, pixel_angle, into)
+    report = compiled.leaf_statistics(
+        kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32)),
+        kernel_batch(o, d, batch),
+        kernel_options(options),
+        statistics=kernel_statistics(into, pixel_angle),
+    )
+    return _step_report(report, len(d))
+
+
+def _step_report(report: tuple[float, float, float], n_rays: int) -> StepReport:
+    squared, weight, samples = report
+    return StepReport(squared / max(3 * weight, 1e-30), samples / max(n_rays, 1))

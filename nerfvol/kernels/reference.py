@@ -205,7 +205,7 @@ def loss(octree: Octree, values: Tensor, rays_o, rays_d, target, weight, options
 
     sum_rays weight * ( |C - target|^2 + colour * (sum_i w_i |c_i - target|^2 + T |background - target|^2)
                         + distortion * L_distortion
-                        + sum_i length_i / side_i (smooth_density * roughness of density + smooth_colour * of colour) ),
+                        + sum_i length_i / side_i (tv_density * roughness of density + tv_sh * of colour) ),
     distances of the distortion in root cubes; the last sum goes over the leaves that the ray crosses.
     """
     n = len(rays_o)
@@ -222,10 +222,10 @@ def loss(octree: Octree, values: Tensor, rays_o, rays_d, target, weight, options
         length = (s.segments.t_far - s.segments.t_near) / octree.size
         spread = distortion(s.weights, s.middle / octree.size, length, ray, n)
         total = total + options.distortion * spread
-    if options.smooth_density > 0 or options.smooth_colour > 0:
+    if options.tv_density > 0 or options.tv_sh > 0:
         density, colour = roughness(octree, values, s.segments.leaf)
         side = torch.from_numpy(octree.leaf_sizes()).to(values.dtype)[s.segments.leaf]
         sides = (s.segments.t_far - s.segments.t_near) / side
-        total = total + _per_ray(n, ray, sides * (options.smooth_density * density + options.smooth_colour * colour))
+        total = total + _per_ray(n, ray, sides * (options.tv_density * density + options.tv_sh * colour))
     report = {"squared_error": squared.detach(), "samples": s}
     return (weight * total).sum(), report

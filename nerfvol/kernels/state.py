@@ -11,6 +11,10 @@ from nerfvol.defaults import DEFAULT_EARLY_STOP, WHITE
 from nerfvol.native import aligned, aligned_empty
 from nerfvol.octree.tree import Octree
 
+OUTPUTS = ("rgb", "opacity", "depth", "median_depth", "normal")
+"""What can be rendered, in the order of the kernels' arguments."""
+TILE_RAYS = 64
+"""Rays of a packet that share their origin."""
 SQUARE = 16
 """Pixels along a square of a view: what the kernels render as one packet."""
 
@@ -61,19 +65,28 @@ class Batch:
 
 @dataclass(frozen=True)
 class LossOptions:
-    """Weights of the loss's terms: see reference.loss for the formula."""
+    """Weights of the loss's terms, see reference.loss for the formula; fields reach the kernels by their names.
+
+    background: three floats behind the octree; colour: of what each segment misses the target by; distortion: of
+    Mip-NeRF 360's loss; tv_density, tv_sh: of the differences between a leaf's corners, in raw density and in SH
+    coefficients; early_stop_eps: a ray ends when its transmittance falls below.
+    """
 
     background: Sequence[float] = WHITE
     colour: float = 0.0
     distortion: float = 0.0
-    smooth_density: float = 0.0
-    smooth_colour: float = 0.0
+    tv_density: float = 0.0
+    tv_sh: float = 0.0
     early_stop_eps: float = DEFAULT_EARLY_STOP
 
 
 @dataclass(frozen=True)
 class Rates:
-    """RMSprop: value -= rate * g / (sqrt(m) + eps), m the running mean of g^2 (started with the first g^2)."""
+    """RMSprop: value -= rate * g / (sqrt(m) + eps), m the running mean of g^2 (started with the first g^2).
+
+    density, dc, sh: rates of raw densities, of the constant SH coefficients and of the others; beta: share of the old
+    mean in the new. Fields reach the kernels by their names.
+    """
 
     density: float
     dc: float
@@ -90,41 +103,46 @@ class StepReport:
     samples: float
 
 
-class TrainState:
-    """What training keeps beside the octree: second moments (n_vertices, row) and statistics of the leaves (n_leaves,).
+class LeafStatistics:
+    """What the rays of one batch or several say of each leaf: float32 arrays (n_leaves,), updated in place.
 
-    max_weight: largest rendering weight; error: sum of weight x squared error; footprint: largest size in pixels; all
-    since :meth:`reset_statistics`.
+    max_weight: largest rendering weight; error: sum of weight x squared error; footprint: largest size in pixels, 0
+    where no ray met the leaf; all since :meth:`reset_statistics`.
     """
 
+    def __init__(self, octree: Octree):
+        self.reset_statistics(octree.n_leaves)
+
+    def check(self, octree: Octree) -> None:
+        """ValueError unless every array fits the octree: the kernels write to them without looking."""
+        for name in ("max_weight", "error", "footprint"):
+            self._check_array(name, (octree.n_leaves,), np.float32)
+
+    def reset_statistics(self, n_leaves: int) -> None:
+        """Begins anew, for an octree of ``n_leaves``."""
+        self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
+
+    def _check_array(self, name: str, shape: tuple[int, ...], dtype: type) -> None:
+        a = getattr(self, name)
+        if a.shape != shape or a.dtype != dtype or not a.flags.c_contiguous:
+            raise ValueError(f"training state: {name} must be {np.dtype(dtype)} {shape}, got {a.dtype} {a.shape}")
+
+
+class TrainState(LeafStatistics):
+    """What training keeps beside the octree: the leaves' statistics, and second moments (n_vertices, row) float32."""
+
     def __init__(self, octree: Octree, moments: np.ndarray | None = None):
+        """Moments are zero where none are given; ValueError where those given do not fit the octree."""
+        super().__init__(octree)
         if moments is None:
             moments = aligned_empty(octree.values.shape, np.float32)
             moments[:] = 0
         self.moments = aligned(moments, np.float32)
-        self.slots = np.full(octree.n_vertices, -1, np.int32)
-        self.reset_statistics(octree.n_leaves)
+        self.slots = np.full(octree.n_vertices, -1, np.int32)  # the kernels' scratch, all -1 between steps
         self.check(octree)
 
     def check(self, octree: Octree) -> None:
-        """ValueError unless every array fits the octree: the kernels write to them without looking."""
-        leaves = (octree.n_leaves,)
-        for name, shape in (
-            ("moments", octree.values.shape),
-            ("slots", (octree.n_vertices,)),
-            ("max_weight", leaves),
-            ("error", leaves),
-            ("footprint", leaves),
-        ):
-            a, dtype = getattr(self, name), np.int32 if name == "slots" else np.float32
-            if a.shape != shape or a.dtype != dtype or not a.flags.c_contiguous:
-                raise ValueError(f"training state: {name} must be {np.dtype(dtype)} {shape}, got {a.dtype} {a.shape}")
-
-    def reset_statistics(self, n_leaves: int) -> None:
-        self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
-
-
-TILE_RAYS = 64
-
-
-OUTPUTS = ("rgb", "opacity", "depth", "median_depth", "normal")
+        """As for :class:`LeafStatistics`."""
+        self._check_array("moments", octree.values.shape, np.float32)
+        self._check_array("slots", (octree.n_vertices,), np.int32)
+        super().check(octree)

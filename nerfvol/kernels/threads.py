@@ -1,4 +1,4 @@
-"""How many threads the kernels use, and which build of them runs."""
+"""How many threads the kernels use, which build of them runs, and the memory that they keep between calls."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from nerfvol.native import native
 
 
 def set_threads(n: int) -> None:
-    """Threads of the kernels, and of torch where it is loaded or stands in for them."""
+    """Threads of the kernels, and of torch where it is loaded or stands in for them; ValueError below 1."""
     if n < 1:
         raise ValueError(f"threads must be at least 1, got {n}")
     if (compiled := native()) is not None:
@@ -21,6 +21,7 @@ def set_threads(n: int) -> None:
 
 
 def get_threads() -> int:
+    """Threads of the kernels, or of torch where it stands in for them."""
     compiled = native()
     if compiled is not None:
         return compiled.get_threads()
@@ -42,10 +43,22 @@ def isa() -> str:
 
 
 def set_isa(name: str) -> None:
-    """Chooses a build: "auto" or one of :func:`available_isas`."""
+    """Chooses a build: "auto" or one of :func:`available_isas`; ValueError for another."""
     compiled = native()
     if compiled is None or not compiled.set_isa(name):
         raise ValueError(f"instruction set {name!r} is not available here, choose from {available_isas()}")
+
+
+def arena_bytes() -> int:
+    """Bytes that the kernels keep between training steps: as much as the largest step left to its second phase."""
+    compiled = native()
+    return compiled.arena_bytes() if compiled is not None else 0
+
+
+def release_arenas() -> None:
+    """Gives back what :func:`arena_bytes` counts; the next step takes what it needs."""
+    if (compiled := native()) is not None:
+        compiled.release_arenas()
 
 
 if native() is not None and "NERFVOL_ISA" in os.environ:

@@ -123,13 +123,13 @@ def _measure_here(threads: int) -> Machine:
 # ------------------------------------------------------------------ what rays need
 def touched(octree: Octree, batches: Iterable[ops.Batch], pixel_angle: float) -> Work:
     """What the rays of all ``batches`` touch together; ``octree`` stays as it is."""
-    state, still = ops.TrainState(octree), ops.Rates(density=0.0, dc=0.0, sh=0.0)
+    statistics, options = ops.LeafStatistics(octree), ops.LossOptions()
     rays, segments = 0, 0.0
     for batch in batches:
-        report = ops.train_step(octree, state, batch, ops.LossOptions(), still, pixel_angle)
+        report = ops.leaf_statistics(octree, batch, options, pixel_angle, statistics)
         rays += int(np.count_nonzero(batch.weight))
         segments += report.samples * len(batch.rays_d)
-    met = state.footprint > 0  # of every leaf that a ray crosses, whatever its weight
+    met = statistics.footprint > 0  # of every leaf that a ray crosses, whatever its weight
     vertices = np.zeros(octree.n_vertices, bool)
     vertices[octree.corners[met]] = True
     return Work(rays, segments, int(np.count_nonzero(met)), int(np.count_nonzero(vertices)))

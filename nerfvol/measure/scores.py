@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,11 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.images import map_threads
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
+from nerfvol.files import pictures
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import psnr, ssim
-from nerfvol.octree.tree import Octree
-from nerfvol.views import render_image
+from nerfvol.models import Model
+from nerfvol.views import depth_range, surface_depth
 
 LARGEST_PSNR = 100.0
 """Equal images have infinite PSNR, which JSON cannot say; an 8-bit image has 100 dB only where it is equal."""
@@ -68,17 +70,33 @@ def score_views(
     }
 
 
-def evaluate_octree(
-    octree: Octree,
+def evaluate(
+    model: Model,
     dataset: Dataset,
     background: Sequence[float],
     early_stop_eps: float = DEFAULT_EARLY_STOP,
-    on_view: Callable[[int, Float, Float], None] | None = None,
     lod: float = DEFAULT_LOD,
+    on_view: Callable[[int, Float, Float], None] | None = None,
 ) -> dict[str, Any]:
-    """:func:`score_views` of ``octree``, drawn as ``nerfvol render`` draws it (see render.render_image)."""
+    """:func:`score_views` of ``model``, drawn as ``nerfvol render`` draws it (see models.Model.render)."""
 
     def render(camera: Camera) -> Float:
-        return render_image(octree, camera, background, early_stop_eps, ("rgb",), lod)["rgb"]
+        return model.render(camera, background, ("rgb",), early_stop_eps, lod)["rgb"]
 
     return score_views(render, dataset, background, on_view)
+
+
+def comparison_writer(
+    folder: Path, model: Model, dataset: Dataset, background: Sequence[float], early_stop_eps: float, lod: float
+) -> Callable[[int, Float, Float], None]:
+    """For :func:`evaluate`'s on_view: writes truth | render | error | depth of each view to ``folder``."""
+    depths = depth_range(model, dataset.cameras)
+
+    def write(index: int, truth: Float, image: Float) -> None:
+        camera = dataset.cameras[index]
+        geometry = model.render(camera, background, ("opacity", "depth"), early_stop_eps, lod)
+        depth = pictures.depth_to_grey(surface_depth(geometry), geometry["opacity"], *depths)
+        panels = [truth, image, pictures.error_map(truth, image), depth]
+        pictures.write_png(folder / f"{dataset.names[index]}.png", pictures.side_by_side(panels))
+
+    return write

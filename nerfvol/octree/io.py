@@ -17,6 +17,7 @@ from nerfvol import __version__
 from nerfvol.errors import InputError
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.octree import codec
+from nerfvol.octree.topology import number_corners
 from nerfvol.octree.tree import Octree
 
 FORMAT = "nerfvol octree"
@@ -37,11 +38,18 @@ def save_octree(
 
     ``metadata`` is JSON-able and comes back from :func:`load_octree`; by custom it has "provenance" (data, command,
     seed, seconds), "background" and "orbit". ``storage``: "float32" is exact; "float16" halves the file; "compact" is
-    quantised and deflated to about a tenth (see nerfvol.octree_codec).
+    quantised and deflated to about a tenth (see nerfvol.octree.codec).
 
     Raises:
-        InputError: the path cannot be written, or a value is not finite.
+        InputError: the path cannot be written, a value is not finite, or leaves that touch do not share their
+            vertices (lod.cut, lod.at_level): a file says where leaves are, and their vertices follow from that.
     """
+    corners, n_vertices = number_corners(octree.leaf_level, octree.leaf_ijk)
+    if n_vertices != octree.n_vertices or not np.array_equal(corners, octree.corners):
+        raise InputError(
+            f"cannot write {path}: leaves of this octree that touch do not share their vertices, as a file's do; "
+            "nerfvol.octree.lod.simplified makes one that can be written"
+        )
     density, sh = octree.density, octree.sh
     if not (_bounded(density) and _bounded(sh)):
         raise InputError(f"cannot write {path}: the octree holds values beyond {LARGEST_VALUE:g} or not finite")

@@ -22,10 +22,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerfvol.errors import InputError
 from nerfvol.native import aligned_empty, native
 from nerfvol.octree.rows import DENSITY_SLOT, Averages, explin, explin_inverse
 from nerfvol.octree.topology import (
-    OFFSETS,
+    LATTICE_OF_CORNER,
+    LATTICE_WEIGHTS,
     POPCOUNT,
     bits_of,
     level_starts,
@@ -118,8 +120,7 @@ def _shared(sums: np.ndarray, corners: np.ndarray, n_vertices: int) -> tuple[np.
 
 
 # Trilinear weights, over 8, of the children's corners at their node's corners: (child, node's corner, child's corner).
-_PLACES = (OFFSETS[:, None] + OFFSETS)[:, None] / 2
-_WEIGHTS = np.where(OFFSETS[:, None] == 1, _PLACES, 1 - _PLACES).prod(-1).astype(np.float32) / 8
+_WEIGHTS = LATTICE_WEIGHTS[LATTICE_OF_CORNER].transpose(0, 2, 1).astype(np.float32) / 8
 
 
 def _restrict(
@@ -191,6 +192,36 @@ def cut(octree: Octree, nodes: ArrayLike) -> Octree:
 
 
 def at_level(octree: Octree, level: int) -> Octree:
-    """The octree without leaves finer than ``level`` >= 1."""
+    """The octree without leaves finer than ``level`` >= 1: :func:`cut` there, so to be drawn and not to be saved."""
     starts = level_starts(octree.node_mask)
     return cut(octree, np.repeat(np.arange(len(starts) - 1), np.diff(starts)) >= level)
+
+
+def simplified(octree: Octree, level: int) -> Octree:
+    """The octree of :func:`at_level` with shared vertices, as every proper octree has them: it can be saved and trained.
+
+    Where leaves and nodes that touch hold different values, their vertex has the mean that the averages have (see the
+    module's head): of the opacities over the side of a cell of ``level``, and of the colours weighted by these. Other
+    vertices keep their rows bit by bit. Raises InputError for a level below 1.
+    """
+    if level < 1:
+        raise InputError(f"an octree is simplified to level 1 or finer, got {level}")
+    apart = at_level(octree, level)
+    new = Octree.from_leaves(
+        apart.leaf_level, apart.leaf_ijk, octree.origin, octree.size, octree.sh_degree, octree.density_scale
+    )
+    side = np.float32(octree.size / 2.0**level)
+    thickness = (octree.density_scale * explin(apart.density)).astype(np.float32) * side
+    opacity = np.minimum(-np.expm1(-thickness), OPAQUE)
+    weighted = apart.values * opacity[:, None]
+    weighted[:, DENSITY_SLOT] = opacity
+    rows, mean = _shared(weighted[apart.corners], new.corners, new.n_vertices)
+    extinction = -np.log1p(-mean) / side
+    rows[:, DENSITY_SLOT] = explin_inverse(np.maximum(extinction / octree.density_scale, CLEAREST))
+    least, greatest = np.full(new.n_vertices, apart.n_vertices), np.zeros(new.n_vertices, np.int64)
+    np.minimum.at(least, new.corners, apart.corners)
+    np.maximum.at(greatest, new.corners, apart.corners)
+    alone = least == greatest
+    rows[alone] = apart.values[least[alone]]
+    new.values = rows
+    return new

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from nerfvol.octree.rows import explin
-from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.topology import LATTICE_OF_CORNER, LATTICE_STRIDES, LATTICE_WEIGHTS, OFFSETS
 from nerfvol.octree.tree import Octree
 
 
@@ -45,29 +45,23 @@ def _keys(ijk: np.ndarray, level: int) -> np.ndarray:
     return (x << 2 * level) + (y << level) + z
 
 
-_LATTICE = np.array(list(np.ndindex(3, 3, 3)))
-_LATTICE_OF_CORNER = (OFFSETS[:, None] + OFFSETS[None]) @ np.array([9, 3, 1])  # (child, corner) -> lattice point
-_PARENT_WEIGHTS = np.prod(
-    np.where(OFFSETS[None] == 1, _LATTICE[:, None] / 2, 1 - _LATTICE[:, None] / 2), axis=-1
-)  # (27, 8)
-
-
 def _merge_error(octree: Octree, families: np.ndarray) -> np.ndarray:
     """(m,) error of replacing families (m, 8) by their parents."""
     vertices = np.empty((len(families), 27), dtype=np.int64)
-    vertices[:, _LATTICE_OF_CORNER.reshape(-1)] = octree.corners[families].reshape(len(families), 64)
-    corners = vertices[:, (OFFSETS * 2) @ np.array([9, 3, 1])]
+    vertices[:, LATTICE_OF_CORNER.reshape(-1)] = octree.corners[families].reshape(len(families), 64)
+    corners = vertices[:, (OFFSETS * 2) @ LATTICE_STRIDES]
+    weights = LATTICE_WEIGHTS.T.astype(np.float32)
     edge = octree.leaf_sizes()[families[:, :1]]
     scale = octree.density_scale * edge
     raw = octree.density.astype(np.float32)
     truth = -np.expm1(-scale * explin(raw[vertices]))
-    guess = -np.expm1(-scale * explin(raw[corners] @ _PARENT_WEIGHTS.T.astype(np.float32)))
+    guess = -np.expm1(-scale * explin(raw[corners] @ weights))
     error = np.abs(guess - truth).max(1)
     sh = octree.sh
     for channel in range(3):
         for k in range(sh.shape[-1]):
             own = sh[:, channel, k]
-            change = np.abs(own[corners] @ _PARENT_WEIGHTS.T.astype(np.float32) - own[vertices])
+            change = np.abs(own[corners] @ weights - own[vertices])
             # |Y_k| <= sqrt((2 l + 1) / (4 pi))
             bound = math.sqrt((2 * math.isqrt(k) + 1) / (4 * math.pi))
             error = np.maximum(error, bound * (change * truth).max(1))

@@ -66,7 +66,7 @@ class Transfer:
         if compiled is not None and rows.dtype == np.float32:
             compiled.interpolate(np.ascontiguousarray(rows), self.old_corners, self.source, self.place, out)
             return out
-        weights = _LATTICE_WEIGHTS.astype(rows.dtype)
+        weights = LATTICE_WEIGHTS.astype(rows.dtype)
         for start in range(0, len(out), 65536):
             part = slice(start, start + 65536)
             w, corners = weights[self.place[part]], self.old_corners[self.source[part]]
@@ -77,11 +77,12 @@ class Transfer:
         return out
 
 
-# The 27 points of a leaf's 3x3x3 lattice (index 9 x + 3 y + z) and their trilinear weights at its corners.
+# The 27 points of a leaf's 3x3x3 lattice (index 9 x + 3 y + z) and their trilinear weights at its corners (27, 8).
 _LATTICE = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
-_LATTICE_WEIGHTS = np.prod(np.where(OFFSETS[None] == 1, _LATTICE[:, None] / 2, 1 - _LATTICE[:, None] / 2), axis=-1)
+LATTICE_WEIGHTS = np.prod(np.where(OFFSETS[None] == 1, _LATTICE[:, None] / 2, 1 - _LATTICE[:, None] / 2), axis=-1)
 _LATTICE_CORNERS = np.flatnonzero((_LATTICE % 2 == 0).all(1))
-_STRIDES = np.array([9, 3, 1])
+LATTICE_STRIDES = np.array([9, 3, 1])
+LATTICE_OF_CORNER = (OFFSETS[:, None] + OFFSETS) @ LATTICE_STRIDES  # (child, corner of the child) -> index of the point
 
 
 def build_masks(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -231,7 +232,7 @@ def find_sources(
         return source, place
     inside = OFFSETS[np.maximum(octant, 0)][:, None] + OFFSETS
     lattice = np.where((octant < 0)[:, None, None], OFFSETS * 2, inside)
-    places = (lattice @ _STRIDES).astype(np.int8).ravel()
+    places = (lattice @ LATTICE_STRIDES).astype(np.int8).ravel()
     leaves, flat = np.repeat(parent, 8), corners.ravel()
     is_corner = np.isin(places, _LATTICE_CORNERS)
     for chosen in (np.flatnonzero(~is_corner)[::-1], np.flatnonzero(is_corner)[::-1]):  # the first one is written last

@@ -28,11 +28,12 @@ from nerfvol.errors import InputError
 from nerfvol.field.fields import Domain, RadianceField, SHField
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
-from nerfvol.measure.scores import evaluate_octree, score_views
+from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.octree.merge import merge_smooth
 from nerfvol.octree.rows import EMPTY_DENSITY, explin_inverse
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
+from nerfvol.views import OctreeModel
 
 _CHUNK = 32768  # points of one evaluation of the field
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
@@ -115,7 +116,7 @@ def distill(
     if render_field is not None:
         few = dataset.evenly(config.compare_views).smaller(config.compare_downscale, background)
         field_psnr = score_views(render_field, few, background)["psnr"]
-        octree_psnr = evaluate_octree(octree, few, background)["psnr"]
+        octree_psnr = evaluate(OctreeModel(octree), few, background)["psnr"]
     levels, counts = np.unique(octree.leaf_level, return_counts=True)
     report = DistillReport(
         leaves=octree.n_leaves, vertices=octree.n_vertices,
@@ -159,7 +160,7 @@ class Frame:
 
 
 @torch.no_grad()
-def evaluate(function: Callable[[Tensor], Tensor], positions: np.ndarray) -> np.ndarray:
+def in_chunks(function: Callable[[Tensor], Tensor], positions: np.ndarray) -> np.ndarray:
     """``function`` of positions (n, 3), in chunks; the result as one array of n rows."""
     points = torch.from_numpy(np.ascontiguousarray(positions, dtype=np.float32))
     return torch.cat([function(part) for part in points.split(_CHUNK)]).numpy()
@@ -229,7 +230,7 @@ def largest_sigma(field: RadianceField, corners: np.ndarray, edge: float, per_ax
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
     best = np.zeros(len(corners), dtype=np.float32)
     for offset in offsets:
-        np.maximum(best, evaluate(field.density, corners + offset), out=best)
+        np.maximum(best, in_chunks(field.density, corners + offset), out=best)
     return best
 
 
@@ -271,7 +272,7 @@ def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int =
         part = slice(start, start + _CHUNK)
         sigma_sum, sh_sum = np.zeros_like(sigma[part]), np.zeros_like(sh[part], np.float64)
         for offset in offsets:
-            rows = evaluate(to_sh, positions[part] + spacing[part, None] * offset).astype(np.float64)
+            rows = in_chunks(to_sh, positions[part] + spacing[part, None] * offset).astype(np.float64)
             sigma_sum = sigma_sum + rows[:, 0]
             sh_sum = sh_sum + (rows[:, :1] + 1e-6) * rows[:, 1:]
         sh[part] = sh_sum / (sigma_sum + 1e-6 * len(offsets))[:, None]
@@ -321,11 +322,10 @@ def _sphere(n: int) -> tuple[Tensor, Tensor]:
 def largest_weights(octree: Octree, dataset: Dataset, background: Sequence[float], downscale: int) -> np.ndarray:
     """(n_leaves,) largest rendering weight of each leaf over all rays of the dataset at 1/downscale of its size."""
     bank = TileBank(dataset, background, downscale)
-    state = ops.TrainState(octree)
-    options, still = ops.LossOptions(tuple(background), early_stop_eps=1e-3), ops.Rates(0.0, 0.0, 0.0)
+    statistics, options = ops.LeafStatistics(octree), ops.LossOptions(tuple(background), early_stop_eps=1e-3)
     for tiles in np.array_split(np.arange(bank.n_tiles), max(1, bank.n_tiles // 32)):
-        # A training step with rates of zero: it moves nothing and notes the weights. At this size of the images leaves are
-        # small, and what a tile leaves behind for the second phase of a step is large: few tiles at a time.
+        # At this size of the images leaves are small, and what a tile leaves behind for the second phase is large: few
+        # tiles at a time.
         batch = bank.batch(tiles, np.ones(len(tiles), dtype=np.float32))
-        ops.train_step(octree, state, batch, options, still, bank.pixel_angle)
-    return state.max_weight
+        ops.leaf_statistics(octree, batch, options, bank.pixel_angle, statistics)
+    return statistics.max_weight

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from nerfvol.errors import InputError
 from nerfvol.field.fields import Domain, NeuralField, RadianceField, make_field
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
+from nerfvol.kernels.state import StepReport
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
 
 if TYPE_CHECKING:
@@ -37,6 +39,12 @@ def domain_of(scene: SceneBounds) -> Domain:
     if scene.is_unbounded:
         outer = max(1.0, float(np.abs(np.asarray(scene.background_cube) - center).max() / half))
     return Domain(tuple(center.tolist()), half, outer)
+
+
+FIELD_SHARE = 0.3
+"""Of the time left in a run, the most that the field gets."""
+SECONDS_TO_DISTILL = 2.0
+"""Kept for the end of a run while a field is trained: what an octree takes to be written."""
 
 
 class PixelBank:
@@ -150,8 +158,22 @@ def _shade_in_pieces(
     return rgb, composite_packed(sigmas, samples.t_ends - samples.t_starts, samples.ray_indices, len(rays_o))
 
 
+@dataclass(frozen=True)
+class FieldReport(StepReport):
+    """squared_error: of the batch; samples: a ray; loss: with the regularisers; downscale: of the images in the batch."""
+
+    loss: float
+    n_rays: int
+    downscale: int
+
+    @property
+    def psnr(self) -> float:
+        """Of the batch, dB."""
+        return -10 * math.log10(max(self.squared_error, 1e-12))
+
+
 class FieldTrainer:
-    """Trains one field on one dataset, a step at a time.
+    """Trains one field on one dataset, a step at a time; a phase (training.phase.Phase).
 
     Args:
         dataset: posed images.
@@ -173,10 +195,55 @@ class FieldTrainer:
         self.optimizer = torch.optim.Adam(
             self.field.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
         )
-        self.steps_done = 0
+        self.steps_done, self.stage = 0, 0  # an image scale is no stage: nothing else changes with it
         self.n_rays = max(1, min(config.max_rays, config.samples_per_step // 64))
         self._banks: dict[int, PixelBank] = {}
 
+    # ------------------------------------------------------------------ what a run asks of a phase
+    name = "field"
+    rates = "field.learning_rate"
+    previews = (0.1, 0.4, 1.0)
+    preview_width = 100  # a field renders slowly
+    stages_left = 0
+    most_steps = math.inf
+
+    @property
+    def steps(self) -> int:
+        """Of the whole schedule without a time budget."""
+        return self.config.steps
+
+    @property
+    def parameter_bytes(self) -> int:
+        """Bytes of the network."""
+        return sum(p.numel() * p.element_size() for p in self.field.parameters())
+
+    def share_of(self, seconds: float) -> float:
+        """``field.time_budget``, and at most FIELD_SHARE: an octree must follow."""
+        return min(self.config.time_budget, FIELD_SHARE * seconds)
+
+    def size(self) -> str:
+        """See Phase."""
+        return f"{self.n_rays} rays"
+
+    def seconds_to_write(self) -> float:
+        """Distilling comes first."""
+        return SECONDS_TO_DISTILL
+
+    def needs_images(self) -> bool:
+        """The octree will."""
+        return True
+
+    def outgrown(self) -> str | None:
+        """A field does not grow."""
+        return None
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """(height, width, 3) float32 image of the field as ``camera`` sees it."""
+        rays_o, rays_d = (torch.from_numpy(rays) for rays in camera.rays())
+        shape = (camera.intrinsics.height, camera.intrinsics.width, 3)
+        return self.render(rays_o, rays_d)["rgb"].numpy().reshape(shape)
+
+    # ------------------------------------------------------------------ training
     def find_samples(self, rays_o: Tensor, rays_d: Tensor, generator: torch.Generator | None = None) -> Samples:
         """Where to look along rays; jittered with a generator, the middles without."""
         near_plane = self.config.near_fraction * self.domain.half if self.domain.outer > 1 else 0.0
@@ -196,26 +263,18 @@ class FieldTrainer:
         """``render_field`` of the field as it is now."""
         return render_field(self.field, rays_o, rays_d, self.background.tolist(), self.find_samples, chunk)
 
-    def render_camera(self, camera: Camera) -> np.ndarray:
-        """(height, width, 3) float32 image of the field as ``camera`` sees it."""
-        rays_o, rays_d = (torch.from_numpy(rays) for rays in camera.rays())
-        shape = (camera.intrinsics.height, camera.intrinsics.width, 3)
-        return self.render(rays_o, rays_d)["rgb"].numpy().reshape(shape)
-
-    def step(self, progress: float | None = None) -> dict[str, float]:
+    def step(self, progress: float | None = None) -> FieldReport:
         """One optimisation step.
 
         Args:
             progress: how much of the run is over, 0 to 1; None = steps done / ``config.steps``.
 
-        Returns:
-            loss, psnr of the batch (dB), samples_per_ray, n_rays, downscale.
         """
         config = self.config
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         generator = step_generator(self.seed, self.steps_done)
         self._set_learning_rate(progress)
-        stage = self._stage(progress)
+        stage = self._stage_at(progress)
         bank, self.schedule = self._bank(stage), self.schedules[stage]
         rays_o, rays_d, target = bank.sample(self.n_rays, generator)
         samples = self.find_samples(rays_o, rays_d, generator)
@@ -232,14 +291,10 @@ class FieldTrainer:
         n_rays = self.n_rays
         self._update_grid(samples, rays_o, rays_d, sigmas, generator)
         self._follow_samples(len(sigmas))
-        mse = max(float(error.detach()), 1e-12)
-        return {
-            "loss": float(loss.detach()),
-            "psnr": -10 * math.log10(mse),
-            "samples_per_ray": len(sigmas) / n_rays,
-            "n_rays": n_rays,
-            "downscale": config.downscales[stage],
-        }
+        return FieldReport(
+            squared_error=float(error.detach()), samples=len(sigmas) / n_rays, loss=float(loss.detach()), n_rays=n_rays,
+            downscale=config.downscales[stage],
+        )  # fmt: skip
 
     def _regularisers(
         self, rgb: Tensor, parts: Composite, samples: Samples, target: Tensor, generator: torch.Generator
@@ -276,7 +331,7 @@ class FieldTrainer:
         wanted = self.config.samples_per_step / max(per_ray, 1.0)
         self.n_rays = max(1, min(self.config.max_rays, int(min(wanted, 1.25 * self.n_rays + 16))))
 
-    def _stage(self, progress: float) -> int:
+    def _stage_at(self, progress: float) -> int:
         ends = self.config.stage_ends
         return next((stage for stage, end in enumerate(ends) if progress < end), len(ends) - 1)
 

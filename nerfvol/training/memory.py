@@ -11,10 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.tiles import rich_share
 from nerfvol.errors import InputError
+from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
 from nerfvol.octree.rows import BLOCKS
+from nerfvol.octree.tree import Octree
 
 BASE_BYTES = 160 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
@@ -120,7 +124,7 @@ def estimate_training(
     beside = beside or Beside()
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
     octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
-    growth = 0 if dataset.reload is None or vertices is not None else change + octree // 2
+    growth = 0 if not dataset.can_reload or vertices is not None else change + octree // 2
     tiles = int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
     return MemoryEstimate(
         base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
@@ -186,6 +190,38 @@ def splits_within(split: np.ndarray, gain: np.ndarray, most: int | None) -> np.n
     kept = np.zeros(len(split), dtype=bool)
     kept[wanted[np.argsort(-gain[wanted], kind="stable")[:room]]] = True
     return kept
+
+
+class OctreePlan:
+    """How large the octree of a run may become, and what memory that takes beside everything else.
+
+    Attributes: max_leaves, a bound on splitting; rich_tiles, about so many training tiles are not plain background.
+    """
+
+    def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int) -> None:
+        """Raises InputError where not even a coarse octree fits in the memory at hand."""
+        self._dataset, lens = dataset, dataset.cameras[0].intrinsics
+        share = rich_share(dataset, config.background)
+        pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
+        self.rich_tiles = max(share, 0.01) * pixels / TILE_RAYS
+        self._beside = Beside(share, held_out_bytes, field=config.init == "mlp")
+        self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
+        wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)
+        self.max_leaves = affordable_leaves(dataset, self._degree, least=min(wanted, 1 << 18), beside=self._beside)
+        self._announced = min(wanted, self.max_leaves)
+
+    def sentence(self) -> str:
+        """The estimate in words."""
+        return estimate_training(self._dataset, self._announced, self._degree, self._beside).sentence()
+
+    def outgrown(self, octree: Octree) -> str | None:
+        """A sentence where ``octree`` has more leaves than were announced: a surface has about so many, a thick medium
+        several times as many. Once for each larger octree."""
+        if octree.n_leaves <= self._announced:
+            return None
+        self._announced = octree.n_leaves
+        estimate = estimate_training(self._dataset, self._announced, self._degree, self._beside, octree.n_vertices)
+        return f"memory: the octree outgrew the estimate; now {estimate.sentence()}"
 
 
 def gib(size: int) -> str:

@@ -8,10 +8,12 @@ per-sample colour and distortion terms that empty space, smoothness that fades; 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
+from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.tiles import Cursor, TileBank
@@ -23,10 +25,16 @@ from nerfvol.octree.topology import Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 from nerfvol.starts.fog import thin_octree
-from nerfvol.training.memory import splits_within
+from nerfvol.training.memory import OctreePlan, splits_within
+from nerfvol.views import render_image
 
 BEHIND = 2
 """Stream of random numbers of the colours behind photographs; TileBank has 0 and 1."""
+FEWEST_STEPS = 5000
+"""Before a run with a time budget may end early, however few its tiles."""
+SECONDS_TO_WRITE = 0.5
+"""... and read an octree, beside ..."""
+SECONDS_TO_WRITE_A_LEAF = 1.5e-6
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
 FINAL_TILES = 4096
@@ -34,10 +42,24 @@ FINAL_TILES = 4096
 
 
 class OctreeTrainer:
-    """Optimises an octree on a dataset. ``progress`` runs from 0 to 1 and drives every schedule."""
+    """Optimises an octree on a dataset, from a given one or one of low density; a phase (training.phase.Phase).
+
+    ``progress`` runs from 0 to 1 and drives every schedule. ``plan``: how large the octree may become; None: no bound.
+    """
+
+    name = "octree"
+    rates = "octree.rate_density, octree.rate_dc and octree.rate_sh"
+    previews = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+    preview_width = 200
 
     def __init__(
-        self, dataset: Dataset, background: Sequence[float], config: OctreeConfig, seed: int, octree: Octree | None
+        self,
+        dataset: Dataset,
+        background: Sequence[float],
+        config: OctreeConfig,
+        seed: int = 0,
+        octree: Octree | None = None,
+        plan: OctreePlan | None = None,
     ):
         config = config.for_scene(dataset.scene)
         n = len(config.levels)
@@ -50,17 +72,59 @@ class OctreeTrainer:
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
-        self.step_count = 0
+        self.steps_done = 0
         self.rich, self.plain = Cursor(), Cursor()
         self.prunings = 0
         self.tiles_seen = 0
         self.bank: TileBank | None = None
-        self.max_leaves: int | None = None
+        self.plan = plan
+        self.max_leaves = plan.max_leaves if plan else None
         """Bound on splitting, where memory is short; None: none."""
+        self.steps = config.steps
+        drawn = config.tiles[-1] * (config.rich_share or 1.0)
+        self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.rich_tiles / drawn) if plan else math.inf
 
     def _thin_start(self) -> Octree:
         return thin_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
 
+    # ------------------------------------------------------------------ what a run asks of a phase
+    @property
+    def stages_left(self) -> int:
+        """See Phase."""
+        return len(self.config.levels) - 1 - self.stage
+
+    def share_of(self, seconds: float) -> float:
+        """All of the time left: nothing comes after the octree."""
+        return seconds
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """(H, W, 3) as the camera sees the leaves: prefiltered nodes would be made again for each picture."""
+        return render_image(self.octree, camera, self.background, outputs=("rgb",), lod=0.0)["rgb"]
+
+    def size(self) -> str:
+        """See Phase."""
+        return f"{self.octree.n_leaves:,} leaves"
+
+    def seconds_to_write(self) -> float:
+        """In compact storage (two cores of 2023); a run that takes longer ends later."""
+        return SECONDS_TO_WRITE + SECONDS_TO_WRITE_A_LEAF * self.octree.n_leaves
+
+    def needs_images(self) -> bool:
+        """Until the tiles at hand serve to the end."""
+        return self.bank is None or len(set(self.config.downscales[self.stage :])) > 1
+
+    def outgrown(self) -> str | None:
+        """See Phase."""
+        return self.plan.outgrown(self.octree) if self.plan else None
+
+    def take_octree(self) -> Octree:
+        """The finished octree; tiles, moments and statistics are released."""
+        octree = self.finish()
+        vars(self).pop("octree")
+        return_free_memory()
+        return octree
+
+    # ------------------------------------------------------------------ the schedule
     @property
     def _start(self) -> float:
         """The share of the schedule that a given octree skips."""
@@ -73,7 +137,7 @@ class OctreeTrainer:
             "node_mask": t.node_mask, "leaf_mask": t.leaf_mask, "values": t.values, "moments": s.moments,
             "origin": t.origin, "size": t.size, "density_scale": t.density_scale, "sh_degree": t.sh_degree,
             "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
-            "stage": self.stage, "first_stage": self.first_stage, "step_count": self.step_count,
+            "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
             "prunings": self.prunings, "tiles_seen": self.tiles_seen,
             "rich": dataclasses.asdict(self.rich), "plain": dataclasses.asdict(self.plain),
         }  # fmt: skip
@@ -93,11 +157,11 @@ class OctreeTrainer:
             if np.shape(state[name]) != (octree.n_leaves,):
                 raise InputError(f"checkpoint: {name} does not fit the octree's {octree.n_leaves} leaves")
             setattr(self.state, name, np.array(state[name], dtype=np.float32))
-        for name in ("stage", "first_stage", "step_count", "prunings", "tiles_seen"):
+        for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
         self.rich, self.plain = Cursor(**state["rich"]), Cursor(**state["plain"])
         # The bank says when enough was seen to prune: where it stood before, it must stand at once.
-        self.bank = None if self.step_count == 0 else self._make_bank()
+        self.bank = None if self.steps_done == 0 else self._make_bank()
 
     def step(self, progress: float) -> ops.StepReport:
         """One step at ``progress`` in [0, 1] of the run."""
@@ -110,15 +174,21 @@ class OctreeTrainer:
         if self.bank is None:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
-        smooth = fade if self.step_count >= c.smooth_from else 0.0
-        terms = c.colour * fade, c.distortion * fade, c.smooth_density * smooth, c.smooth_colour * smooth
-        options = ops.LossOptions(self._behind(), *terms, c.early_stop_eps)
+        smooth = fade if self.steps_done >= c.smooth_from else 0.0
+        options = ops.LossOptions(
+            background=self._behind(),
+            colour=c.colour * fade,
+            distortion=c.distortion * fade,
+            tv_density=c.smooth_density * smooth,
+            tv_sh=c.smooth_colour * smooth,
+            early_stop_eps=c.early_stop_eps,
+        )
         late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
         rate = c.rate_decay**late
-        rates = ops.Rates(c.rate_density * rate, c.rate_dc * rate, c.rate_sh * rate, c.beta)
+        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=c.beta)
         batch = self.bank.draw(c.tiles[self.stage], c.rich_share, self.seed, self.rich, self.plain)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
-        self.step_count += 1
+        self.steps_done += 1
         self.tiles_seen += c.tiles[self.stage]
         return report
 
@@ -129,7 +199,7 @@ class OctreeTrainer:
         """
         if not self.dataset.scene.is_unbounded:
             return self.background
-        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, BEHIND, self.step_count])))
+        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, BEHIND, self.steps_done])))
         return tuple(random.random(3).tolist())
 
     def _make_bank(self) -> TileBank:
@@ -174,7 +244,7 @@ class OctreeTrainer:
     def _worth_splitting(self, progress: float) -> bool:
         """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
         c, stage = self.config, self.stage + 1
-        left = self.step_count * (1 - progress) / max(progress - self._start, 1e-9)
+        left = self.steps_done * (1 - progress) / max(progress - self._start, 1e-9)
         return left >= (c.fine_steps if c.levels[stage] >= c.fine_from else c.prunes[stage] * c.prune_steps)
 
     def _seen_enough(self) -> bool:
@@ -223,7 +293,7 @@ class OctreeTrainer:
         keep = self._needed(self.config.prune_weight)
         if not keep.any():
             raise InputError(
-                f"the octree collapsed to empty space at step {self.step_count}: no training ray needs any of it; check "
+                f"the octree collapsed to empty space at step {self.steps_done}: no training ray needs any of it; check "
                 "that --background is the images' background and that the scene bounds contain the object, or lower "
                 "octree.colour and octree.distortion"
             )

@@ -1,25 +1,38 @@
-"""Before a run begins: its folder, the settings it is resumed with, and what becomes of an earlier run in its place."""
+"""Before a run begins: its folder, the settings it is resumed with, and its data, read and refused where it is useless."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nerfvol.config.assemble import read_yaml, to_plain, write_yaml
 from nerfvol.config.training import Config
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import composite_average
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import ensure_writable_folder, explain_os_error
-from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, OCTREE, PREVIOUS
+from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, PREVIOUS, PRODUCTS
 
-_FILES = (CONFIG, OCTREE, DISTILLED, CHECKPOINT, METRICS, LOG)
-
-
+HELD_OUT_KEPT = 32 << 20
+"""Bytes of held-out images that a run keeps; more are read once again to be scored."""
+COMPARED_SIZE = 200
+"""Pixels along the middle of a held-out view on which field and octrees are compared: a field takes seconds for so many."""
+LARGEST_HELD_OUT = 32
+"""Views that a run scores itself on; `nerfvol eval` scores all there are."""
+_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG)
 _FREE = {"data", "out", "time_budget", "threads", "resume", "checkpoint_every", "storage", "compare_views"}
 """Settings that a resumed run may change; all others have already shaped its numbers."""
 
 
+# ------------------------------------------------------------------ the folder
 def resumable_config(run: str | os.PathLike[str]) -> Path:
     """RUN/config.yaml of a run that can be resumed."""
     config, checkpoint = Path(run) / CONFIG, Path(run) / CHECKPOINT
@@ -29,18 +42,27 @@ def resumable_config(run: str | os.PathLike[str]) -> Path:
     return config
 
 
-def prepare_run(config: Config) -> Path:
-    """Make the run folder, prove that it can be written, put an earlier run aside and write the resolved config.
+def check_folder(config: Config) -> Path:
+    """The run folder, made where it is missing and proved to be writable; nothing in it is touched.
 
-    An earlier run in the same folder moves to RUN/previous (one generation is kept), unless this run resumes it.
+    Raises:
+        InputError: it cannot be written, or a resumed run is asked for other settings than it was begun with.
     """
     run = ensure_writable_folder(config.out)
     if config.resume:
         _refuse_changes(read_yaml(run / CONFIG), to_plain(config))
-    else:
+    return run
+
+
+def claim_folder(config: Config) -> None:
+    """Put an earlier run in the folder aside and write the resolved config: for a run that has made its first step.
+
+    The earlier run moves to RUN/previous (one generation is kept), unless this run resumes it.
+    """
+    run = Path(config.out)
+    if not config.resume:
         _set_aside(run)
     write_yaml(run / CONFIG, dataclasses.replace(config, resume=False))  # the file as --config starts a run of its own
-    return run
 
 
 def _refuse_changes(old: dict[str, Any], new: dict[str, Any]) -> None:
@@ -54,7 +76,7 @@ def _refuse_changes(old: dict[str, Any], new: dict[str, Any]) -> None:
             key, before, value = f"{key}.{inner}", before.get(inner), value[inner]
         raise InputError(
             f"--resume: the run was begun with {key} = {before}, which cannot become {value} half-way; "
-            "leave the option out, or train anew"
+            "leave the option out, or train again from the start"
         )
 
 
@@ -70,3 +92,56 @@ def _set_aside(run: Path) -> None:
             os.replace(path, previous / path.name)
     except OSError as error:
         raise InputError(f"cannot move the earlier run to {previous}: {explain_os_error(error)}") from error
+
+
+# ------------------------------------------------------------------ the data
+@dataclass(frozen=True)
+class Data:
+    """What a run trains on and scores itself on.
+
+    compared: parts of held-out views on which field, distilled and fine-tuned octree are compared. first: the first
+    held-out view, for previews. reading: seconds that it takes to read the held-out images again; 0: they are kept.
+    """
+
+    training: Dataset
+    held_out: Dataset
+    compared: Dataset
+    first: Dataset
+    reading: float
+
+    @property
+    def held_out_bytes(self) -> int:
+        """Bytes of the images that stay in memory beside the training images."""
+        return self.held_out.nbytes or self.first.nbytes + self.compared.nbytes
+
+
+def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
+    """Reads the views of ``config.data``; ``say`` gets the sentences that a person should see.
+
+    Raises:
+        InputError: the data cannot be used, or there is nothing in the images.
+    """
+    started = time.perf_counter()
+    held_out = load_dataset(config.data, "val", config.downscale, config.aabb).evenly(LARGEST_HELD_OUT)
+    first = held_out.evenly(1)
+    compared = held_out.evenly(config.compare_views).middles(COMPARED_SIZE)
+    reading = 0.0
+    if held_out.nbytes > HELD_OUT_KEPT:  # else released until they are scored
+        held_out.release()
+        reading = time.perf_counter() - started
+    training = load_dataset(config.data, "train", config.downscale, config.aabb)
+    for message in training.messages:
+        say(message)
+    require_something(training, config.background)
+    return Data(training, held_out, compared, first, reading)
+
+
+def require_something(dataset: Dataset, background: Sequence[float]) -> None:
+    """An InputError where every pixel of every picture has the background's colour: there is nothing to reconstruct."""
+    plain = np.round(np.asarray(background) * 255)
+    if all((composite_average(image, background, 1) == plain).all() for image in dataset.images):
+        colour = ",".join(f"{c:g}" for c in background)
+        raise InputError(
+            f"{dataset.source}: the training images are empty, nothing in them differs from the background {colour}; "
+            "check the images, or choose another --background"
+        )

@@ -2,85 +2,113 @@
 
 Without a time budget a run is a fixed number of steps and no clock is read for anything but the log and the moments of
 checkpoints: the same seed gives the same bits, for any number of threads, stopped and resumed or not. With a budget,
-progress is the share of the time that is over, and every stage ends with the best it has.
+progress is the share of the time that is over, and every phase ends with the best it has.
 
-A checkpoint holds all that lives between two steps. It is written every ``config.checkpoint_every`` seconds and on
-Ctrl-C, under a temporary name: kill -9 costs at most that interval.
+A checkpoint holds all that lives between two steps. It is written after the first step of a phase, every
+``config.checkpoint_every`` seconds and on Ctrl-C, under a temporary name: kill -9 costs at most that interval.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
+import functools
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from nerfvol import __version__
-from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import Config
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
 from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
-from nerfvol.measure.scores import evaluate_octree, score_views
-from nerfvol.octree.io import load_octree, save_octree
+from nerfvol.measure.scores import evaluate, score_views
+from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
+from nerfvol.training.memory import OctreePlan
 from nerfvol.training.octree_trainer import OctreeTrainer
-from nerfvol.training.session import Clock, Run, read_saved
-from nerfvol.views import render_image
+from nerfvol.training.phase import Phase
+from nerfvol.training.prepare import check_folder, load_data
+from nerfvol.training.session import Clock, Run, Say, read_saved
+from nerfvol.views import OctreeModel
 
-FEWEST_STEPS = 5000
-"""Of the octree, before a run with a time budget may end early, however few its tiles."""
 LOG_EVERY = 50
 """Steps between two lines of the log."""
 
 
-def train(config: Config, started: float | None = None) -> Path:
-    """One training run as ``config`` says, in the folder ``config.out``, which it returns.
+@dataclass(frozen=True)
+class Results:
+    """What a run came to. model: its file; metrics: what metrics.json holds; size: of the model, in words; compared: the
+    parts of views on which the rows of metrics["results"] were scored, in words."""
+
+    folder: Path
+    model: Path
+    metrics: dict[str, Any]
+    size: str
+    compared: str
+
+
+def train(config: Config, started: float | None = None, say: Say | None = None) -> Results | None:
+    """One training run as ``config`` says, in the folder ``config.out``.
 
     Args:
         config: all settings; with ``resume`` the run goes on from its checkpoint.
         started: moment (``time.perf_counter``) at which the time budget begins; default: the start of the process.
+        say: gets each sentence that a person should see; default: prints it.
+
+    Returns:
+        what the run came to; None where a resumed run was finished already.
 
     Raises:
         InputError: data that cannot be used, too little memory, a full disk, a scene that collapses to empty space.
         KeyboardInterrupt: Ctrl-C, after the step was finished and a checkpoint written.
     """
+    say = say or functools.partial(print, flush=True)
     keep_large_arrays_apart()
-    out = Path(config.out)
+    out = check_folder(config)
     saved = read_saved(out / run_folder.CHECKPOINT) if config.resume else None
     if saved is not None and saved["phase"] == "done":
-        print(f"{out} is finished ({saved['steps']} steps), there is nothing to resume; its settings can be run anew "
-              f"with --config {out / run_folder.CONFIG}")  # fmt: skip
-        return out
-    run = Run(config, Clock(started, saved["elapsed"] if saved else 0.0), saved)
-    with run.interruptible(), run.open_log():
+        say(f"{out} is finished ({saved['steps']} steps), there is nothing to resume; its settings can be run again "
+            f"with --config {out / run_folder.CONFIG}")  # fmt: skip
+        return None
+    clock = Clock(started, saved["elapsed"] if saved else 0.0)
+    data = load_data(config, say)
+    run = Run(config, data, clock, saved, say)
+    config = run.config
+    plan = OctreePlan(config, data.training, data.held_out_bytes)
+    lens = data.training.cameras[0].intrinsics
+    say(f"{len(data.training)} training views of {lens.width}x{lens.height}, {len(data.held_out)} held out; "
+        f"memory: {plan.sentence()}")  # fmt: skip
+    with run.interruptible(), run:
         from_field = config.init == "mlp" and run.phase in ("start", "field")
-        phase = OctreePhase(run, start_from_field(run) if from_field else None)
-        optimise(run, phase)
-        finish(run, phase)
-    return out
+        octree = start_from_field(run) if from_field else None
+        trainer = OctreeTrainer(data.training, config.background, config.octree, config.seed, octree, plan)
+        del octree
+        optimise(run, trainer)
+        trained = [trainer.take_octree()]
+        del trainer
+        return finish(run, trained)
 
 
 # ------------------------------------------------------------------ the loop
-def optimise(run: Run, phase: FieldPhase | OctreePhase) -> None:
+def optimise(run: Run, phase: Phase) -> None:
     """Steps until the phase is over, with all that goes on beside them."""
     run.enter(phase)
     progress = run.progress(phase)
     with progress_bar(phase.name, progress) as bar:
         while progress < 1:
             stage = phase.stage
-            error, samples = phase.step(progress)
-            run.follow(phase, error)
+            report = phase.step(progress)
+            run.follow(phase, report.squared_error)
             before, progress = progress, run.progress(phase)
+            run.claim(phase)
             if phase.steps_done % LOG_EVERY == 0 or progress >= 1:
-                run.log(phase, progress, error, samples)
-            bar.set_postfix_str(run.status(phase, error, samples), refresh=False)
+                run.log(phase, progress, report)
+            bar.set_postfix_str(run.status(phase, report), refresh=False)
             bar.update(min(progress, 1.0) - before)
             for moment in phase.previews:
                 if before < moment <= progress:
@@ -93,169 +121,75 @@ def optimise(run: Run, phase: FieldPhase | OctreePhase) -> None:
             if run.checkpoint_due():
                 run.save(phase)
     if phase.stages_left:
-        print(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
+        run.say(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
 
 
 def start_from_field(run: Run) -> Octree:
-    """Trains the field and distils it."""
-    phase = FieldPhase(run)
-    optimise(run, phase)
-    return distil_field(run, phase)
-
-
-def distil_field(run: Run, phase: FieldPhase) -> Octree:
-    """The field as an octree, with the scores of both; says what was lost."""
+    """Trains the field and distils it; the octree, and the scores of both among the run's results."""
     from nerfvol.starts.field import distill
+    from nerfvol.training.field_trainer import FieldTrainer
 
-    config, background = run.config, run.config.background
-    run.stages["field"] = {"seconds": run.phase_seconds(), "steps": phase.steps_done, "leaves": None,
-                           "MB": phase.parameter_bytes / 1e6}  # fmt: skip
+    config, background, data = run.config, run.config.background, run.data
+    ops.set_threads(ops.get_threads())  # torch was loaded only now
+    field = FieldTrainer(data.training, config.field, config.seed, background)
+    optimise(run, field)
+    run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
+                            "MB": field.parameter_bytes / 1e6}  # fmt: skip
     settings = dataclasses.replace(
-        config.distill, level=min(config.distill.level, max(config.octree.levels)), sh_degree=config.octree.sh_degree
+        config.distill,
+        level=min(config.distill.level or 16, max(config.octree.levels)),
+        sh_degree=config.octree.sh_degree,
     )
     started = time.perf_counter()
-    octree, report = distill(
-        phase.trainer.trained_field(), phase.trainer.domain, run.dataset, background, settings, phase.picture
-    )
+    octree, report = distill(field.trained_field(), field.domain, data.training, background, settings, field.picture)
     for message in report.messages:
-        print(message)
-    print(report, flush=True)
-    written = save_octree(run.folder / run_folder.DISTILLED, octree, run.metadata(), config.storage)
-    run.stages["distilled"] = {"seconds": time.perf_counter() - started, "leaves": octree.n_leaves,
-                               "MB": written / 1e6, "lost_on_training_views_db": report.lost_db}  # fmt: skip
-    few = run.comparison_views
-    run.stages["field"] |= summary(score_views(phase.picture, few, background))
-    run.stages["distilled"] |= summary(evaluate_octree(octree, few, background))
+        run.say(message)
+    run.say(str(report))
+    distilled = OctreeModel(octree, run.metadata())
+    written = distilled.save(run.folder / run_folder.DISTILLED, config.storage)
+    run.results["distilled"] = {"seconds": time.perf_counter() - started, "leaves": octree.n_leaves,
+                                "MB": written / 1e6, "lost_on_training_views_db": report.lost_db}  # fmt: skip
+    run.results["field"] |= summary(score_views(field.picture, data.compared, background))
+    run.results["distilled"] |= summary(evaluate(distilled, data.compared, background))
     return octree
 
 
-def finish(run: Run, phase: OctreePhase) -> None:
-    """Writes the octree, scores what was written, writes the scores."""
-    config, path = run.config, run.folder / run_folder.OCTREE
-    seconds = run.phase_seconds()
-    written = save_octree(path, phase.take_octree(), run.metadata(), config.storage)
+def finish(run: Run, trained: list[Octree]) -> Results:
+    """Writes the model, scores what was written, writes the scores. ``trained`` is emptied: its memory is needed."""
+    run.claim(None)
+    config, path, seconds = run.config, run.folder / run_folder.OCTREE, run.phase_seconds()
+    written = OctreeModel(trained.pop(), run.metadata()).save(path, config.storage)
     return_free_memory()
-    stored, _ = load_octree(path)
-    scores = evaluate_octree(stored, run.held_out, config.background)
-    row = {"seconds": seconds, "steps": run.steps["octree"], "leaves": stored.n_leaves, "MB": written / 1e6}
-    if run.stages:
-        run.stages["fine_tuned"] = row | summary(evaluate_octree(stored, run.comparison_views, config.background))
-    lens = run.held_out.cameras[-1].intrinsics
+    model = load_model(path)
+    scores = evaluate(model, run.data.held_out, config.background)
+    counts = _counts(model)
+    row = {"seconds": seconds, "steps": run.steps[model.kind], "MB": written / 1e6, **counts}
+    if run.results:
+        run.results["fine_tuned"] = row | summary(evaluate(model, run.data.compared, config.background))
+    lens = run.data.held_out.cameras[-1].intrinsics
     metrics = {
         **summary(scores), "n_images": len(scores["rows"]), "split": "val", "image_size": [lens.width, lens.height],
         "background": list(config.background), "downscale": config.downscale, "seconds": run.clock.elapsed(),
-        "steps": run.steps, "leaves": stored.n_leaves, "vertices": stored.n_vertices, "MB": written / 1e6,
+        "steps": run.steps, "representation": model.kind, **counts, "MB": written / 1e6,
         "storage": config.storage, "init": config.init, "seed": config.seed, "time_budget": config.time_budget,
         "data": config.data, "threads": ops.get_threads(), "hardware": describe_hardware(),
-        "peak_memory_MB": (peak_memory() or 0) / 1e6, "nerfvol": __version__, "stages": run.stages,
+        "peak_memory_MB": (peak_memory() or 0) / 1e6, "nerfvol": __version__, "results": run.results,
         "rows": scores["rows"],
     }  # fmt: skip
     write_json(run.folder / run_folder.METRICS, metrics)
     save_checkpoint(run.checkpoint, {"phase": "done", "steps": sum(run.steps.values())})
-    print_table(run, metrics)
-
-
-# ------------------------------------------------------------------ what is optimised
-class FieldPhase:
-    """The field, before it is distilled."""
-
-    name = "field"
-    previews = (0.1, 0.4, 1.0)
-    preview_width = 100  # a field renders slowly
-    stages_left = n_leaves = n_vertices = 0
-    most_steps = math.inf
-
-    def __init__(self, run: Run) -> None:
-        from nerfvol.training.field_trainer import FieldTrainer
-
-        ops.set_threads(ops.get_threads())  # torch was loaded only now
-        self.trainer = FieldTrainer(run.dataset, run.config.field, run.config.seed, run.config.background)
-        self.steps, self.stage = run.config.field.steps, 0
-
-    @property
-    def steps_done(self) -> int:
-        return self.trainer.steps_done
-
-    @property
-    def parameter_bytes(self) -> int:
-        """Bytes of the network."""
-        return sum(p.numel() * p.element_size() for p in self.trainer.field.parameters())
-
-    def step(self, progress: float) -> tuple[float, float]:
-        """Squared error and samples per ray of one step."""
-        report = self.trainer.step(progress)
-        return 10 ** (-report["psnr"] / 10), report["samples_per_ray"]
-
-    def picture(self, camera: Camera) -> np.ndarray:
-        """(H, W, 3) as the camera sees the field."""
-        import torch
-
-        rays_o, rays_d = (torch.from_numpy(a) for a in camera.rays())
-        lens = camera.intrinsics
-        return self.trainer.render(rays_o, rays_d)["rgb"].numpy().reshape(lens.height, lens.width, 3)
-
-    def size(self) -> str:
-        return f"{self.trainer.n_rays} rays"
-
-
-class OctreePhase:
-    """The octree, from a thin start or from a distilled field."""
-
-    name = "octree"
-    previews = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
-    preview_width = 200
-
-    def __init__(self, run: Run, octree: Octree | None) -> None:
-        config = run.config
-        self.background, self.steps = config.background, config.octree.steps
-        drawn = (
-            config.octree.rich_share * config.octree.tiles[-1] if config.octree.rich_share else config.octree.tiles[-1]
-        )
-        self.most_steps = max(FEWEST_STEPS, config.octree.most_epochs * run.rich_tiles / drawn)
-        self.trainer = OctreeTrainer(run.dataset, config.background, config.octree, config.seed, octree)
-        self.trainer.max_leaves = run.max_leaves
-
-    @property
-    def steps_done(self) -> int:
-        return self.trainer.step_count
-
-    @property
-    def stage(self) -> int:
-        return self.trainer.stage
-
-    @property
-    def stages_left(self) -> int:
-        return len(self.trainer.config.levels) - 1 - self.trainer.stage
-
-    def step(self, progress: float) -> tuple[float, float]:
-        """Squared error and samples per ray of one step."""
-        report = self.trainer.step(progress)
-        return report.squared_error, report.samples
-
-    def picture(self, camera: Camera) -> np.ndarray:
-        """(H, W, 3) as the camera sees the leaves: averages would be made anew for each picture."""
-        return render_image(self.trainer.octree, camera, self.background, outputs=("rgb",), lod=0.0)["rgb"]
-
-    def take_octree(self) -> Octree:
-        """The finished octree; tiles, moments and statistics are let go."""
-        octree = self.trainer.finish()
-        del self.trainer
-        return_free_memory()
-        return octree
-
-    @property
-    def n_leaves(self) -> int:
-        return self.trainer.octree.n_leaves
-
-    @property
-    def n_vertices(self) -> int:
-        return self.trainer.octree.n_vertices
-
-    def size(self) -> str:
-        return f"{self.n_leaves:,} leaves"
+    few = run.data.compared.cameras[-1].intrinsics
+    size = ", ".join(f"{count:,} {name}" for name, count in counts.items())
+    return Results(run.folder, path, metrics, size, f"middle {few.width}x{few.height} of {len(run.data.compared)}")
 
 
 # ------------------------------------------------------------------ small things
+def _counts(model: Model) -> dict[str, int]:
+    """What the model is made of, by name."""
+    described = model.describe()
+    return {name: described[name] for name in ("leaves", "vertices") if name in described}
+
+
 def progress_bar(name: str, done: float) -> tqdm[Any]:
     """A bar from 0 to 1 with an estimate of the time left; nothing where the output is no terminal."""
     shape = "{desc} {percentage:3.0f}% |{bar:20}| {elapsed}<{remaining} {postfix}"
@@ -265,20 +199,3 @@ def progress_bar(name: str, done: float) -> tqdm[Any]:
 def summary(scores: dict[str, Any]) -> dict[str, Any]:
     """Means of the scores, without the rows."""
     return {key: scores[key] for key in ("psnr", "ssim", "seconds_per_frame")}
-
-
-def print_table(run: Run, metrics: dict[str, Any]) -> None:
-    """What the run came to, in a few lines."""
-    if run.stages:
-        few = run.comparison_views
-        lens = few.cameras[-1].intrinsics
-        views = f"middle {lens.width}x{lens.height} of {len(few)}"
-        print(f"\n{views:21s}PSNR    SSIM   seconds     leaves      MB   s/frame")
-        for name, row in run.stages.items():
-            leaves = "" if row["leaves"] is None else f"{row['leaves']:,}"
-            print(f"{name.replace('_', '-'):18s} {row['psnr']:6.2f}  {row['ssim']:.4f} {row['seconds']:9.1f} "
-                  f"{leaves:>10s} {row['MB']:7.1f} {row['seconds_per_frame']:9.4f}")  # fmt: skip
-    background = ",".join(f"{c:g}" for c in metrics["background"])
-    print(f"\n{metrics['n_images']} held-out views on background {background}: PSNR {metrics['psnr']:.2f} dB, "
-          f"SSIM {metrics['ssim']:.4f}; {metrics['leaves']:,} leaves, {metrics['MB']:.1f} MB, "
-          f"{metrics['seconds_per_frame']:.3f} s per frame, {metrics['seconds']:.0f} s in all", flush=True)  # fmt: skip

@@ -4,14 +4,17 @@ The expected values are worked out here from the definitions in docs/data.md, no
 """
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nerfvol.cameras.calibration import CAMERA_MODELS, lens_keys, read_calibration
 from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, rigid_pose, tile_pixels
-from nerfvol.cameras.lens import distort, undistort
+from nerfvol.cameras.lens import PINHOLE as NO_DISTORTION
+from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError
 
 EPS32, EPS64 = 2.0**-23, 2.0**-52
@@ -133,20 +136,21 @@ def test_each_coefficient_means_what_opencv_says(index):
     coefficients = [0.0] * 6
     coefficients[index] = 0.05
     x, y = 0.3, -0.45
-    found = distort(np.array([[2 * x, 2 * y, 2.0]]), tuple(coefficients))
+    lens = BrownConrady(*coefficients)
+    found = lens.distort(np.array([[2 * x, 2 * y, 2.0]]))
     np.testing.assert_allclose(found[0], forward_pinhole(x, y, *coefficients), rtol=8 * EPS64)
-    direction = undistort(found, tuple(coefficients))[0]
+    direction = lens.undistort(found)[0]
     np.testing.assert_allclose(direction[:2] / direction[2], [x, y], atol=2e-12)
 
 
 def test_fisheye_angles():
-    coefficients = (0.05, -0.02, 0.004, -0.001, 0.0, 0.0)
+    lens = Fisheye(0.05, -0.02, 0.004, -0.001)
     theta = np.array([0.0, 0.3, 1.2, 1.7])  # the last is behind the image plane: 97 degrees from the axis
     expected = theta * (1 + 0.05 * theta**2 - 0.02 * theta**4 + 0.004 * theta**6 - 0.001 * theta**8)
     directions = np.stack([np.sin(theta) * 0.6, np.sin(theta) * 0.8, np.cos(theta)], axis=1)
-    plane = distort(3 * directions, coefficients, fisheye=True)
+    plane = lens.distort(3 * directions)
     np.testing.assert_allclose(plane, expected[:, None] * [0.6, 0.8], atol=8 * EPS64)
-    np.testing.assert_allclose(undistort(plane, coefficients, fisheye=True), directions, atol=2e-12)
+    np.testing.assert_allclose(lens.undistort(plane), directions, atol=2e-12)
 
 
 @settings(max_examples=100, deadline=None)
@@ -157,27 +161,88 @@ def test_fisheye_angles():
     st.floats(0.1, 1.2),
 )
 def test_distortion_round_trip_or_a_clear_refusal(radial, tangential, fisheye, reach):
-    coefficients = (*radial, *([0.0, 0.0] if fisheye else tangential))
+    lens = Fisheye(*radial) if fisheye else BrownConrady(*radial, *tangential)
     steps = np.linspace(-reach, reach, 9)
     plane = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     try:
-        directions = undistort(plane, coefficients, fisheye)
+        directions = lens.undistort(plane)
     except InputError as error:
         assert "cannot be undone" in str(error)
         return
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=4 * EPS64)
-    np.testing.assert_allclose(distort(directions, coefficients, fisheye), plane, atol=1e-11)
+    np.testing.assert_allclose(lens.distort(directions), plane, atol=1e-11)
 
 
 def test_a_lens_that_folds_over_is_refused():
     # r (1 - r^2) never exceeds 0.385, so nothing is seen at 0.6 focal lengths from the axis
     with pytest.raises(InputError, match=r"\(k1=-1\) cannot be undone"):
-        undistort(np.array([[0.1, 0.0], [0.6, 0.0]]), (-1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        BrownConrady(-1.0).undistort(np.array([[0.1, 0.0], [0.6, 0.0]]))
     # r - 2 r^3 + 1.6 r^5 turns back at r = 0.5 and comes forward again: r = 1 gives 0.6, but no lens folds twice
     with pytest.raises(InputError, match="cannot be undone"):
-        undistort(np.array([[0.6, 0.0]]), (-2.0, 1.6, 0.0, 0.0, 0.0, 0.0))
+        BrownConrady(-2.0, 1.6).undistort(np.array([[0.6, 0.0]]))
     with pytest.raises(InputError, match="fisheye"):
-        undistort(np.array([[3.3, 0.0]]), (0.0,) * 6, fisheye=True)  # more than 180 degrees from the axis
+        Fisheye().undistort(np.array([[3.3, 0.0]]))  # more than 180 degrees from the axis
+
+
+def test_how_far_from_the_axis_a_lens_reaches():
+    assert NO_DISTORTION.max_angle == math.pi / 2 and Fisheye().max_angle == math.pi
+    assert math.isclose(BrownConrady(-1.0).max_angle, math.atan(math.sqrt(1 / 3)))  # r (1 - r^2) turns at 1 / sqrt(3)
+    assert math.isclose(Fisheye(-0.1).max_angle, math.sqrt(1 / 0.3))
+
+
+def test_a_lens_is_given_as_one_or_by_its_coefficients():
+    size = (64, 48, 40.0, 41.0, 30.0, 25.0)
+    for by_name, lens in [
+        ({}, NO_DISTORTION), ({"k1": 0.1, "p2": 0.01}, BrownConrady(k1=0.1, p2=0.01)),
+        ({"k1": 0.1, "p1": 0.0, "fisheye": True}, Fisheye(k1=0.1)),
+    ]:  # fmt: skip
+        intrinsics = Intrinsics(*size, **by_name)
+        assert intrinsics == Intrinsics(*size, lens) and hash(intrinsics) == hash(Intrinsics(*size, lens))
+        assert intrinsics.fisheye == isinstance(lens, Fisheye)
+        assert {name: getattr(intrinsics, name) for name in lens.names()} == lens.coefficients
+        assert read_calibration(lens_keys(lens)).lens == lens
+    assert Intrinsics(*size, fisheye=True) != Intrinsics(*size)  # same coefficients, another lens
+    barrel = Intrinsics(*size, BrownConrady(k1=-0.1, k2=0.02))
+    assert replace(barrel, k1=-0.2).lens == BrownConrady(k1=-0.2, k2=0.02)
+    assert replace(barrel, fisheye=True).lens == Fisheye(k1=-0.1, k2=0.02)
+    assert replace(barrel, cx=1.0).lens is barrel.lens
+    with pytest.raises(TypeError, match="has no argument 'k7'"):
+        Intrinsics(*size, k7=0.0)
+    with pytest.raises(TypeError, match="takes a lens, or its coefficients by name"):
+        Intrinsics(*size, 0.1)
+
+
+@dataclass(frozen=True)
+class Stereographic(Lens):
+    """What a further model takes: the angle theta lands at 2 a tan(theta / 2)."""
+
+    KIND = "stereographic"
+
+    a: float = 1.0
+
+    @property
+    def max_angle(self):
+        return math.pi
+
+    def distort(self, points):
+        depth = np.linalg.norm(points, axis=1) + points[:, 2]
+        return 2 * self.a * points[:, :2] / depth[:, None]
+
+    def _undistort(self, plane):
+        half = plane / (2 * self.a)
+        s = (half * half).sum(axis=1, keepdims=True)
+        return np.concatenate([2 * half, 1 - s], axis=1) / (1 + s)
+
+
+def test_a_further_model_is_a_class_and_a_row(monkeypatch):
+    monkeypatch.setitem(CAMERA_MODELS, "STEREOGRAPHIC", Stereographic)
+    keys = {"w": 40, "h": 30, "fl_x": 20.0, "camera_model": "STEREOGRAPHIC", "a": 0.9, "k1": 7}
+    intrinsics = read_calibration(keys).intrinsics(40, 30)
+    assert intrinsics.lens == Stereographic(0.9) and intrinsics.k1 == 0
+    assert lens_keys(intrinsics.lens) == {"a": 0.9, "camera_model": "STEREOGRAPHIC"}
+    pixels = pixel_centres(intrinsics)
+    np.testing.assert_allclose(intrinsics.project(3 * intrinsics.directions_at(pixels)), pixels, atol=1e-12)
+    assert replace(intrinsics, a=0.8).lens == Stereographic(0.8)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -280,7 +345,7 @@ def test_poses_that_are_not_rigid_are_refused(kind, sentence):
     ({"fx": 0.0}, "positive"), ({"fy": -3.0}, "positive"), ({"fy": 1e-320}, "positive"),
     ({"fx": math.nan}, "fx must be a finite"),
     ({"cx": math.inf}, "cx must be a finite"), ({"k3": math.nan}, "k3 must be a finite"),
-    ({"width": 0}, "at least 1x1"), ({"fisheye": True, "p1": 0.1}, "no tangential"),
+    ({"width": 0}, "at least 1x1"), ({"fisheye": True, "p1": 0.1}, "no coefficient p1"),
 ])  # fmt: skip
 def test_singular_intrinsics_are_refused(change, sentence):
     values = {"width": 10, "height": 10, "fx": 10.0, "fy": 10.0, "cx": 5.0, "cy": 5.0}

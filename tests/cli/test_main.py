@@ -12,11 +12,12 @@ import pytest
 
 import nerfvol
 from nerfvol.cli import main
+from nerfvol.cli.command import set_threads
 from nerfvol.config.assemble import run_settings
 from nerfvol.config.training import Config
 from nerfvol.errors import InputError
 from nerfvol.octree.io import save_octree
-from nerfvol.training.prepare import prepare_run
+from nerfvol.training.prepare import check_folder, claim_folder
 from tests.fixtures.tiny import make_sphere_octree, write_scene
 
 ROOT = Path(nerfvol.__file__).parents[1]
@@ -71,9 +72,9 @@ def test_no_arguments_and_version(command):
         (["train", "--data", ".", "--out", "x", "--resume"], "nothing to resume"),
         (["train", "--data", ".", "--out", "file"], "it is a file, not a folder"),
         (["train", "--data", ".", "--out", "x", "more"], "unknown argument 'more'"),
-        (["info", "none"], "no such run folder or octree file"),
+        (["info", "none"], "no such run folder or model file"),
         (["bench"], "needs RUN|FILE"),
-        (["bench", "file"], "not a usable octree file"),
+        (["bench", "file"], "not a usable model file"),
     ],
 )
 def test_one_sentence_and_code_2(tmp_path, command, monkeypatch, arguments, reason):
@@ -147,18 +148,22 @@ def test_info(tmp_path, command):
 
 
 def test_an_earlier_run_is_put_aside_once(tmp_path):
-    config = Config(data=".", out=str(tmp_path / "run"), field=None, octree=None)
-    prepare_run(config)
+    config = Config(
+        data=".",
+        out=str(tmp_path / "run"),
+    )
+    check_folder(config)
+    claim_folder(config)
     assert not (tmp_path / "run" / "previous").exists()
     for text in ("first", "second"):
         (tmp_path / "run" / "octree.safetensors").write_text(text)
         (tmp_path / "run" / "metrics.json").write_text(text)
-        prepare_run(config)
+        claim_folder(config)
         assert (tmp_path / "run" / "previous" / "octree.safetensors").read_text() == text
         assert not (tmp_path / "run" / "octree.safetensors").exists()
     config.resume = True
     (tmp_path / "run" / "octree.safetensors").write_text("third")
-    prepare_run(config)
+    claim_folder(config)
     assert (tmp_path / "run" / "octree.safetensors").read_text() == "third"
 
 
@@ -169,8 +174,8 @@ def test_threads_are_set_everywhere():
 
     before = ops.get_threads()
     try:
-        assert main.set_threads(1) == 1 and ops.get_threads() == 1 and torch.get_num_threads() == 1
-        assert main.set_threads(0) == len(os.sched_getaffinity(0)) == ops.get_threads()
+        assert set_threads(1) == 1 and ops.get_threads() == 1 and torch.get_num_threads() == 1
+        assert set_threads(0) == len(os.sched_getaffinity(0)) == ops.get_threads()
     finally:
         ops.set_threads(before)
 

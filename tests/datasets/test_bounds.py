@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at, orbit
-from nerfvol.datasets.bounds import BoundsHint, estimate_bounds, focus_point, require_seen
+from nerfvol.cameras.focus import focus_point
+from nerfvol.datasets.bounds import BoundsHint, estimate_bounds, require_seen
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
 
@@ -27,16 +28,17 @@ def hemisphere(n=40, radius=4.031, center=(0.0, 0.0, 0.0), jitter=0.0, seed=0):
 
 def test_the_focus_is_what_the_cameras_look_at():
     center = np.array([3.0, -1.0, 2.0])
-    point, certainty = focus_point(hemisphere(center=center))
-    np.testing.assert_allclose(point, center, atol=1e-12)
-    assert 0.3 < certainty < 2 / 3
-    shaken, _ = focus_point(hemisphere(center=center, jitter=0.1, n=400))
-    assert np.linalg.norm(shaken - center) < 0.03  # 0.1 / sqrt(400), three axes, times a few sigma
+    focus = focus_point(hemisphere(center=center))
+    np.testing.assert_allclose(focus.point, center, atol=1e-12)
+    assert 0.3 < focus.certainty < 2 / 3 and focus.ahead == 1 and focus.is_clear
+    shaken = focus_point(hemisphere(center=center, jitter=0.1, n=400))
+    assert np.linalg.norm(shaken.point - center) < 0.03  # 0.1 / sqrt(400), three axes, times a few sigma
 
 
 def test_parallel_axes_have_no_focus():
     cameras = [Camera(NERF_SYNTHETIC, look_at([x, 0, 5], [x, 0, 0], [0, 1, 0])) for x in range(4)]
-    assert focus_point(cameras)[1] < 1e-12
+    focus = focus_point(cameras)
+    assert focus.certainty < 1e-12 and not focus.is_clear
 
 
 def test_nerf_synthetic_gives_the_classical_box():

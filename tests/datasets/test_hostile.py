@@ -19,10 +19,20 @@ ODD = st.one_of(
     st.none(), st.booleans(), st.text(max_size=3), st.just([]), st.just({}), st.just([[1]]),
     st.sampled_from([0, -1, 1e-320, 1e-30, 1e16, 1e30, 1e200, 1e308, -1e308, float("nan"), float("inf"), 10**400]),
 )  # fmt: skip
+
+
+def write_colmap_with_points(folder, cameras, images):
+    scenes.write_colmap(folder, cameras, images)
+    scenes.write_points(folder, cameras, np.random.default_rng(0).normal(size=(5, 3)))
+
+
 FILES = {
     "llff": (scenes.write_llff, "poses_bounds.npy"),
     "colmap cameras": (scenes.write_colmap, "sparse/0/cameras.bin"),
     "colmap images": (scenes.write_colmap, "sparse/0/images.bin"),
+    "colmap points": (write_colmap_with_points, "sparse/0/points3D.bin"),
+    "nsvf intrinsics": (scenes.write_nsvf, "intrinsics.txt"),
+    "nsvf pose": (scenes.write_nsvf, "pose/0_view_001.txt"),
     "transforms": (scenes.write_instant_ngp, "transforms.json"),
     "image": (scenes.write_instant_ngp, "images/view_003.png"),
 }
@@ -31,10 +41,12 @@ FILES = {
 def loads_or_refuses(folder):
     try:
         dataset = load_dataset(folder)
+        points = dataset.points
     except InputError as error:
         assert "\n" not in str(error) and len(str(error)) < 600
         return
     assert len(dataset) == len(dataset.images) and np.isfinite(dataset.scene.aabb).all()
+    assert points is None or np.isfinite(points.positions).all()
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +58,7 @@ def templates(tmp_path_factory):
     return root
 
 
-@pytest.mark.parametrize("name", ["llff", "colmap cameras", "colmap images", "transforms"])
+@pytest.mark.parametrize("name", [name for name in FILES if name != "image"])
 @SETTINGS
 @given(st.lists(st.tuples(st.floats(0, 1), st.integers(0, 255)), min_size=1, max_size=8), st.floats(0.3, 1.5))
 def test_flipped_and_missing_bytes(templates, name, flips, kept):

@@ -122,6 +122,46 @@ def test_points_that_are_nowhere_are_in_no_image(tmp_path, nowhere):
 
 
 @pytest.mark.parametrize("text", [False, True])
+def test_the_points_of_a_model(tmp_path, text):
+    cameras, places = scenes.ring(), np.random.default_rng(0).uniform(-0.3, 0.3, (40, 3))
+    scenes.write_colmap(tmp_path, cameras, scenes.random_images(), text=text)
+    assert load_dataset(tmp_path).points is None
+    scenes.write_points(tmp_path, cameras, places, text=text)
+    dataset = load_dataset(tmp_path, "val", downscale=2)
+    points = dataset.points
+    assert points is dataset.points and len(points) == 40
+    np.testing.assert_array_equal(points.positions, places)  # repr writes what float reads, in text too
+    assert points.positions.dtype == np.float64 and points.colours.dtype == np.uint8
+    np.testing.assert_array_equal(points.colours, [[1, 2, 250]] * 40)
+    np.testing.assert_array_equal(points.track_lengths, [9] * 40)
+    np.testing.assert_array_equal(points.errors, [0.5] * 40)
+    assert points.source.endswith("points3D.txt" if text else "points3D.bin")
+    assert replace(dataset, names=dataset.names).points.source == points.source
+    scenes.write_points(tmp_path, cameras, [(np.nan, 0, 0), (0, 0, 1e300), (-np.inf, 0, 0), (3, 2, 1)], text=text)
+    np.testing.assert_array_equal(load_dataset(tmp_path).points.positions, [[3, 2, 1]])
+
+
+def test_points_are_read_when_they_are_asked_for(tmp_path, monkeypatch):
+    """Of a model's points loading looks at some; what is damaged further on is said by whoever asks for all."""
+    monkeypatch.setattr("nerfvol.datasets.colmap._MOST_POINTS", 2)
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images())
+    scenes.write_points(tmp_path, scenes.ring(), np.zeros((3, 3)))
+    edit(tmp_path / "sparse/0/points3D.bin", lambda d: d[:-7])
+    dataset = load_dataset(tmp_path)
+    with pytest.raises(InputError, match="points3D.bin: the file is truncated"):
+        dataset.points  # noqa: B018
+
+
+@pytest.mark.parametrize("colour", ["1 2 256", "1 -1 3", "1 2.5 3"])
+def test_colours_that_are_none_are_refused(tmp_path, colour):
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), text=True)
+    scenes.write_points(tmp_path, scenes.ring(), np.zeros((3, 3)), text=True)
+    edit(tmp_path / "sparse/0/points3D.txt", lambda d: d.replace(b"1 2 250", colour.encode(), 1))
+    with pytest.raises(InputError, match="expected POINT3D_ID"):
+        load_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("text", [False, True])
 def test_damaged_points_are_refused(tmp_path, text):
     scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), text=text)
     scenes.write_points(tmp_path, scenes.ring(), np.zeros((3, 3)), text=text)

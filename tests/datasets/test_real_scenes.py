@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfvol.datasets.bounds import focus_point
+from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.load import load_dataset
 
-DATA = os.environ.get("NERFVOL_DATA")
+DATA = os.environ.get("NERFVOL_DATA") or None
 
 
 def scene(name):
@@ -58,10 +58,10 @@ def test_fox_reports_the_photographs_that_are_missing():
     assert (lens.width, lens.height) == (135, 240) and lens.k1 == 0.0578421 and lens.p2 == 0.00015575
     assert lens.fx == 1375.52 / 8 and lens.cy == 965.268 / 8
     assert not train.scene.has_alpha and train.scene.is_unbounded
-    point, certainty = focus_point(train.cameras)
-    assert certainty > 0.3
+    focus = focus_point(train.cameras)
+    assert focus.certainty > 0.3
     for camera in train.cameras:  # the fox is in every picture
-        x, y = camera.project([point])[0]
+        x, y = camera.project([focus.point])[0]
         assert 0 < x < 135 and 0 < y < 240
     np.testing.assert_array_equal(train.scene.aabb, held.scene.aabb)
 
@@ -76,9 +76,12 @@ def test_fern():
 
 
 def test_cup():
-    train, held = (load_dataset(scene("cup_colmap"), split) for split in ("train", "val"))
+    train, held = (load_dataset(scene("cup"), split) for split in ("train", "val"))
     assert len(train) == 67 and len(held) == 10 and train.images[0].shape == (600, 800, 3)
-    lenses = {camera.intrinsics for camera in train.cameras + held.cameras}
-    assert len(lenses) == 77 and all(lens.fx == lens.fy > 400 and lens.cx == 400 for lens in lenses)
-    assert focus_point(train.cameras)[1] > 0.3  # all around something, but not around this cup:
-    assert any("only 51 % of what its tracks list lies inside the images" in message for message in train.messages)
+    (lens,) = {camera.intrinsics for camera in train.cameras + held.cameras}
+    assert lens.fx == lens.fy and lens.k1 != 0 and lens.k2 == 0  # SIMPLE_RADIAL
+    assert focus_point(train.cameras).certainty > 0.3
+    points = train.points
+    assert len(points) == 2274 and 0.3 < points.errors.mean() < 1 and points.track_lengths.min() >= 2
+    assert points.colours.std() > 10
+    assert not any("tracks" in message for message in train.messages)  # the points are where the photographs show them

@@ -125,6 +125,8 @@ def test_batches_that_do_not_fit_their_rays_are_refused(octree, change):
         ops.train_step(octree, ops.TrainState(octree), batch(**change), ops.LossOptions(), RATES, 0.01)
     with pytest.raises(ValueError, match="do not fit"):
         on_torch.loss_gradient(octree, torch.from_numpy(octree.values), batch(**change), ops.LossOptions())
+    with pytest.raises(ValueError, match="do not fit"):
+        ops.leaf_statistics(octree, batch(**change), ops.LossOptions(), 0.01, ops.LeafStatistics(octree))
 
 
 @pytest.mark.parametrize("name", ["moments", "slots", "max_weight", "error", "footprint"])
@@ -135,6 +137,9 @@ def test_the_state_of_another_octree_is_refused(octree, name):
         setattr(state, name, spoil(getattr(state, name)))
         with pytest.raises(ValueError, match=name):
             ops.train_step(octree, state, batch(), ops.LossOptions(), RATES, 0.01)
+        if name not in ("moments", "slots"):
+            with pytest.raises(ValueError, match=name):
+                ops.leaf_statistics(octree, batch(), ops.LossOptions(), 0.01, state)
     with pytest.raises(ValueError, match="moments"):
         ops.TrainState(octree, np.zeros((3, 16), np.float32))
 
@@ -167,6 +172,9 @@ WHOLE = """
     batch = ops.Batch(o, d, np.zeros((100, 3), np.float32), np.full(100, 0.01, np.float32))
     options = ops.LossOptions(colour=0.1, distortion=0.1)
     reports = [ops.train_step(octree, state, batch, options, ops.Rates(.1, .1, .1), 0.01) for _ in range(3)]
+    ops.leaf_statistics(octree, batch, options, 0.01, state)
+    ops.release_arenas()
+    assert ops.arena_bytes() == 0
     image = ops.render_rays(octree, o, d)
     assert [tuple(v.shape) for v in image.values()] == [(100, 3), (100,), (100,), (100,), (100, 3)]
     assert all(np.isfinite(v).all() for v in image.values())

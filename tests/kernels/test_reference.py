@@ -79,7 +79,7 @@ def test_gradcheck_of_the_images(degree):
 
 @pytest.mark.parametrize(
     "terms",
-    [{}, {"colour": 0.4}, {"distortion": 0.7}, {"smooth_density": 0.3}, {"smooth_colour": 0.3}],
+    [{}, {"colour": 0.4}, {"distortion": 0.7}, {"tv_density": 0.3}, {"tv_sh": 0.3}],
     ids=lambda terms: next(iter(terms), "plain"),
 )
 def test_gradcheck_of_the_loss(terms):
@@ -117,7 +117,7 @@ def test_roughness_of_a_ramp(density, colour):
     weight = torch.tensor([0.5, 2.0], dtype=torch.float64)
     smooth, plain = (
         reference.loss(octree, values, o, d, target, weight, ops.LossOptions(**terms, early_stop_eps=0.0))[0].item()
-        for terms in ({"smooth_density": density, "smooth_colour": colour}, {})
+        for terms in ({"tv_density": density, "tv_sh": colour}, {})
     )
     assert smooth - plain == pytest.approx((0.5 * 4 + 2.0 * 4 * math.sqrt(3)) * edges, rel=1e-6)
 

@@ -1,5 +1,6 @@
 """The training step: gradient of the loss, optimiser, statistics of the leaves, against the float64 reference."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 import torch
 
 from nerfvol.kernels import on_torch, ops, reference
+from nerfvol.kernels.tree import kernel_options
+from nerfvol.native import native
 from nerfvol.octree.rows import sh_slots
 from nerfvol.octree.tree import Octree
 from tests.fixtures.random_octrees import unit
@@ -19,8 +22,8 @@ LOSSES = {
     "plain": ops.LossOptions(BACKGROUND, early_stop_eps=0.0),
     "colour": ops.LossOptions(BACKGROUND, colour=0.3, early_stop_eps=0.0),
     "distortion": ops.LossOptions(BACKGROUND, distortion=0.5, early_stop_eps=0.0),
-    "smooth": ops.LossOptions(BACKGROUND, smooth_colour=0.1, early_stop_eps=0.0),
-    "all": ops.LossOptions(BACKGROUND, 0.1, 0.2, 0.003, 0.02, early_stop_eps=0.0),
+    "smooth": ops.LossOptions(BACKGROUND, tv_sh=0.1, early_stop_eps=0.0),
+    "all": ops.LossOptions(BACKGROUND, colour=0.1, distortion=0.2, tv_density=0.003, tv_sh=0.02, early_stop_eps=0.0),
 }
 PIXEL_ANGLE = 0.01
 
@@ -67,7 +70,7 @@ def loss_bound(case: Case, loss: str) -> np.ndarray:
     d_q = 8 * U * q + d_g @ np.abs(BACKGROUND)
     np.maximum.at(q, t.ray, share)
     np.maximum.at(d_q, t.ray, d_share)
-    smooth = rounding.roughness_bounds(t, octree, weight, options.smooth_density, options.smooth_colour)
+    smooth = rounding.roughness_bounds(t, octree, weight, options.tv_density, options.tv_sh)
     return rounding.gradient_bounds(t, octree, g_hit, q, d_g_hit, d_q) + smooth
 
 
@@ -182,12 +185,9 @@ def test_statistics_of_the_leaves(isa):
     """Largest weight, sum of weight x squared error, largest size in pixels of each leaf, from the float64 segments."""
     case = Case("mixed", 1, 230, n=3)
     octree, batch, t = copy_of(build(case)[0]), batch_of(case), traced(case)
-    state = ops.TrainState(octree)
-    still = ops.Rates(0.0, 0.0, 0.0)
-    values = octree.values.copy()
+    state = ops.LeafStatistics(octree)
     for _ in range(2):  # the maxima stay, the errors add up
-        report = ops.train_step(octree, state, batch, LOSSES["plain"], still, PIXEL_ANGLE)
-    assert np.array_equal(octree.values, values)
+        report = ops.leaf_statistics(octree, batch, LOSSES["plain"], PIXEL_ANGLE, state)
     live = batch.weight[t.ray] > 0
     ray, leaf, w = t.ray[live], t.leaf[live], t.weight[live]
     n = octree.n_leaves
@@ -207,6 +207,61 @@ def test_statistics_of_the_leaves(isa):
     assert report.samples == pytest.approx(len(ray) / len(batch.weight), rel=1e-3)
     state.reset_statistics(n)
     assert not state.error.any() and not state.max_weight.any() and not state.footprint.any()
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_statistics_alone_are_those_of_a_step(isa, degree, compiled, monkeypatch):
+    """Bit by bit, and the query moves nothing: neither values nor what a state keeps beside its statistics."""
+    case = Case("mixed", degree, 233, n=3)
+    octree, batch = copy_of(build(case)[0]), batch_of(case)
+    octree.averages = kept = object()
+    if not compiled:
+        monkeypatch.setattr(ops, "native", lambda: None)
+    alone, state = ops.TrainState(octree), ops.TrainState(octree)
+    alone.moments[:] = 0.5
+    values = octree.values.copy()
+    first = ops.leaf_statistics(octree, batch, LOSSES["all"], PIXEL_ANGLE, alone)
+    assert np.array_equal(octree.values, values) and octree.averages is kept
+    assert (alone.moments == 0.5).all() and (alone.slots == -1).all()
+    assert first == ops.train_step(octree, state, batch, LOSSES["all"], RATES, PIXEL_ANGLE)
+    for name in ("max_weight", "error", "footprint"):
+        assert np.array_equal(getattr(alone, name), getattr(state, name)) and getattr(alone, name).any(), name
+
+
+def test_options_reach_the_kernels_by_their_names():
+    """Every field of the Python classes, with a number of its own, and none that the kernels have beside them."""
+    if (compiled := native()) is None:
+        pytest.skip("no compiled kernels")
+    options = ops.LossOptions((0.5, 0.25, 0.125), *(np.arange(1, 5) / 8), early_stop_eps=0.75)
+    rates = ops.Rates(*(np.arange(1, 6) / 8))
+    for given, kind in ((options, compiled.LossOptions), (rates, compiled.Rates)):
+        there = kernel_options(given)
+        names = {name for name in dir(kind) if not name.startswith("_")}
+        assert type(there) is kind and names == {field.name for field in dataclasses.fields(given)}
+        for name in names:
+            assert np.array_equal(getattr(there, name), getattr(given, name)), name
+
+
+def test_memory_between_steps_does_not_grow_with_the_degrees_seen(threads):
+    """One arena for each thread, whatever the degree: after small rows, large rows take what they take alone."""
+    if native() is None:
+        pytest.skip("no compiled kernels")
+    threads(1)
+
+    def step(degree: int) -> int:
+        octree, o, d = build(Case("mixed", degree, 260, n=40))
+        octree = copy_of(octree)
+        batch = ops.Batch(o, d, np.zeros((len(d), 3), np.float32), np.ones(len(d), np.float32))
+        ops.train_step(octree, ops.TrainState(octree), batch, LOSSES["all"], RATES, PIXEL_ANGLE)
+        return ops.arena_bytes()
+
+    ops.release_arenas()
+    assert ops.arena_bytes() == 0
+    alone = step(3)
+    ops.release_arenas()
+    seen = [step(degree) for degree in (1, 2, 3, 1, 3)]
+    assert 0 < seen[0] <= seen[1] <= seen[2] == seen[3] == seen[4] == alone
 
 
 @pytest.mark.parametrize("origin, way, first_cell, crossed", [
@@ -271,7 +326,7 @@ def test_the_loss_is_what_it_says():
         for i in np.flatnonzero(mine):
             for a, b in edges:
                 away = np.abs(corners[i, a] - corners[i, b])
-                term += options.smooth_density * sides[i] * (away[12] - np.log(1 + away[12]))
-                term += options.smooth_colour * sides[i] * (away[slots] - 0.1 * np.log(1 + away[slots] / 0.1)).sum()
+                term += options.tv_density * sides[i] * (away[12] - np.log(1 + away[12]))
+                term += options.tv_sh * sides[i] * (away[slots] - 0.1 * np.log(1 + away[slots] / 0.1)).sum()
         expected += batch.weight[ray] * term
     assert float(total) == pytest.approx(expected, rel=1e-12)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from nerfvol.datasets.load import load_dataset
-from nerfvol.measure.scores import LARGEST_PSNR, evaluate_octree, score_views
+from nerfvol.measure.scores import LARGEST_PSNR, evaluate, score_views
 from nerfvol.octree.io import save_octree
+from nerfvol.views import OctreeModel
 from tests.fixtures.tiny import make_sphere_octree
 
 
@@ -55,7 +56,7 @@ def test_octree_of_the_scene_agrees_on_any_background(dataset):
     octree = make_sphere_octree(7)
     pairs = []
     for background in ((1, 1, 1), (0, 0, 0), (0.2, 0.7, 0.1)):
-        scores = evaluate_octree(octree, dataset, background, on_view=lambda *pair: pairs.append(pair), lod=0.0)
+        scores = evaluate(OctreeModel(octree), dataset, background, on_view=lambda *pair: pairs.append(pair), lod=0.0)
         assert scores["psnr"] > 28, background  # 29.5: the rim, a leaf of 1/64 wide
     assert len(pairs) == 3 * len(dataset)
     for index, truth, image in pairs:
@@ -84,7 +85,7 @@ def test_eval_command(tmp_path, tiny_scene, sphere_octree, command):
     assert record["n_images"] == len(record["rows"]) == 2
     held_out = load_dataset(tiny_scene, "test")
     background = (0.0, 0.0, 0.0)
-    assert record["psnr"] == pytest.approx(evaluate_octree(sphere_octree, held_out, background)["psnr"], abs=1e-6)
+    assert record["psnr"] == pytest.approx(evaluate(OctreeModel(sphere_octree), held_out, background)["psnr"], abs=1e-6)
     assert record["background"] == [0.0, 0.0, 0.0] and record["image_size"] == [40, 40]
     assert record["threads"] == 1 and record["split"] == "test" and record["kernel_path"]
     assert record["hardware"]["cpu"] and record["hardware"]["cores"] >= 1
@@ -110,8 +111,8 @@ def test_eval_options_from_a_file(tmp_path, tiny_scene, sphere_octree, command):
 @pytest.mark.parametrize(
     "arguments, reason",
     [
-        (["none.safetensors", "--data", "."], "no such run folder or octree file: none.safetensors"),
-        ([".", "--data", "."], "holds no octree.safetensors"),
+        (["none.safetensors", "--data", "."], "no such run folder or model file: none.safetensors"),
+        ([".", "--data", "."], "is no run folder: it holds neither octree.safetensors"),
         (["o.safetensors"], "needs --data"),
         (["o.safetensors", "--data", "nowhere"], "nowhere"),
         (["o.safetensors", "--data", "SCENE", "--split", "all"], "split: expected train or val or test, got 'all'"),
@@ -119,7 +120,7 @@ def test_eval_options_from_a_file(tmp_path, tiny_scene, sphere_octree, command):
         (["o.safetensors", "--data", "SCENE", "--background", "pink"], "white, black or R,G,B"),
         (["o.safetensors", "--data", "SCENE", "--downscale", "100"], "downscale"),
         (["o.safetensors", "--data", "SCENE", "--backgroud", "white"], "did you mean --background"),
-        (["file", "--data", "SCENE"], "file is not a usable octree file"),
+        (["file", "--data", "SCENE"], "file is not a usable model file"),
         ([], "needs RUN|FILE"),
     ],
 )

@@ -7,9 +7,11 @@ import pytest
 
 from nerfvol import native
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
+from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.kernels.state import OUTPUTS
 from nerfvol.octree import lod
+from nerfvol.octree.io import load_octree, save_octree
 from nerfvol.octree.rows import DENSITY_SLOT, explin, explin_inverse
 from nerfvol.octree.topology import OFFSETS, level_starts, place_nodes
 from nerfvol.octree.tree import Octree
@@ -247,6 +249,69 @@ def test_an_octree_cut_off_at_a_level_covers_the_same_leaves():
     assert (np.bincount(found, minlength=coarse.n_leaves) > 0).all()  # nothing added
     same = lod.at_level(octree, 9)
     assert np.array_equal(same.leaf_ijk, octree.leaf_ijk) and np.array_equal(same.values, octree.values)
+
+
+# ------------------------------------------------------------------ octrees that are simplified
+@pytest.mark.parametrize("level", [2, 3, 4])
+def test_a_simplified_octree_saves_and_loads(level, tmp_path):
+    octree = random_octree("mixed", 2, np.random.default_rng(11))
+    apart, simple = lod.at_level(octree, level), lod.simplified(octree, level)
+    simple.validate()
+    assert simple.max_level == level and np.array_equal(simple.leaf_ijk, apart.leaf_ijk)
+    assert simple.n_vertices < apart.n_vertices
+    with pytest.raises(InputError, match="do not share their vertices"):
+        save_octree(tmp_path / "apart.safetensors", apart, {})
+    assert not list(tmp_path.iterdir())
+    save_octree(tmp_path / "simple.safetensors", simple, {})
+    loaded, _ = load_octree(tmp_path / "simple.safetensors")
+    assert np.array_equal(loaded.density, simple.density) and np.array_equal(loaded.sh, simple.sh)
+
+
+def test_what_needs_no_mean_keeps_its_bits():
+    octree = random_octree("mixed", 1, np.random.default_rng(12))
+    same = lod.simplified(octree, octree.max_level)
+    assert np.array_equal(same.corners, octree.corners) and np.array_equal(same.values, octree.values)
+    assert lod.simplified(octree, 9).n_leaves == octree.n_leaves
+    with pytest.raises(InputError, match="level 1 or finer"):
+        lod.simplified(octree, 0)
+
+
+def test_a_constant_field_stays_when_simplified():
+    """Leaves of two levels that fill the cube; some touch nodes that become leaves."""
+    octree, _ = cube(3, scale=2.0).subdivide(np.random.default_rng(13).random(8**3) < 0.4)
+    octree.density, octree.sh = 0.4, np.array([0.5, -0.2, 0.1])[:, None] * [1, 0.3, -0.2, 0.1]
+    for level in (1, 2, 3):
+        simple = lod.simplified(octree, level)
+        np.testing.assert_allclose(simple.density, 0.4, atol=1e-5)
+        np.testing.assert_allclose(simple.sh, np.broadcast_to(octree.sh[:1], simple.sh.shape), atol=1e-6)
+
+
+def test_vertices_between_cells_have_the_mean_by_opacity():
+    """A leaf of level 1 beside a node that becomes one: on their common face each counts once."""
+    octree = Octree.from_leaves([1] + [2] * 8, [[0, 0, 0], *(OFFSETS + [2, 0, 0])], (-1, -1, -1), 2.0, 0, 1.5)
+    octree.density = np.where(octree.vertex_positions()[:, 0] < 0.25, 0.8, 2.5)
+    octree.sh = np.where(octree.vertex_positions()[:, 0] < 0.25, -1.0, 1.0)[:, None, None] * np.ones((1, 3, 1))
+    apart, simple = lod.at_level(octree, 1), lod.simplified(octree, 1)
+    assert (apart.n_vertices, simple.n_vertices) == (16, 12)
+    left, right = (apart.values[apart.corners[i]].astype(float) for i in (0, 1))
+    for corner in range(4):  # of the right cell, its corners of x = 0; the left cell's are numbers 4 to 7
+        rows = np.stack([left[4 + corner], right[corner]])
+        opacity = 1 - np.exp(-1.5 * explin(rows[:, 12]))
+        found = simple.values[simple.corners[1, corner]].astype(float)
+        assert 1 - np.exp(-1.5 * explin(found[12])) == pytest.approx(opacity.mean(), rel=1e-5)
+        assert found[0] == pytest.approx(opacity @ rows[:, 0] / opacity.sum(), abs=1e-5)
+
+
+def test_a_simplified_picture_is_near_that_of_the_cells_apart(sphere_octree):
+    camera = camera_at((3.0, 0.4, 0.6), 48, focal=1.4)
+    level = sphere_octree.max_level - 1
+    images = [
+        render_image(tree, camera, early_stop_eps=0.0, lod=0.0)["rgb"]
+        for tree in (sphere_octree, lod.at_level(sphere_octree, level), lod.simplified(sphere_octree, level))
+    ]
+    apart, simple = (np.sqrt(((image - images[0]) ** 2).mean()) for image in images[1:])
+    between = np.sqrt(((images[2] - images[1]) ** 2).mean())
+    assert between < 0.5 * apart and simple < 1.2 * apart, (between, apart, simple)
 
 
 @pytest.mark.parametrize("bad", [-1.0, math.nan, math.inf])

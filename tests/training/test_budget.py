@@ -1,18 +1,23 @@
 """Time budgets: every stage gets its share, scoring is paid for, earlier sessions count."""
 
+import dataclasses
 import json
 import re
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from nerfvol.cli import main
+from nerfvol.cli.command import set_threads
+from nerfvol.config.training import FieldConfig
+from nerfvol.datasets import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
-from nerfvol.training import session, train
-from nerfvol.training.memory import estimate_training, octree_bytes
-from nerfvol.training.train import OctreePhase
-from tests.fixtures.runs import TINY, Pretended, log_of, settings, start
+from nerfvol.training import field_trainer, octree_trainer, prepare, session
+from nerfvol.training.field_trainer import FieldTrainer
+from nerfvol.training.memory import OctreePlan, gib, octree_bytes
+from nerfvol.training.octree_trainer import OctreeTrainer
+from tests.fixtures.runs import Pretended, log_of, run_of, settings, start
 
 
 @pytest.mark.parametrize("init", ["direct", "mlp"])
@@ -20,7 +25,8 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     """More steps than fit: by a clock that goes on 20 ms at every look, each phase gets its share and is finished."""
     looks = iter(range(10**9))
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 0.02 * next(looks))
-    monkeypatch.setattr(session, "FINISH_SECONDS", 100.0)
+    monkeypatch.setattr(session, "EXPECTED_SECONDS_TO_WRITE", 100.0)
+    monkeypatch.setattr(octree_trainer, "SECONDS_TO_WRITE", 100.0)
     config = settings(tiny_scene, tmp_path, init=init, time_budget=10.0, checkpoint_every=1000)
     config.octree.steps = config.field.steps = 10**9
     start(config)
@@ -31,27 +37,30 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     # All of the time but what is kept to finish: 2 seconds here, by the bound on its share.
     assert log[-1]["seconds"] == pytest.approx(8, abs=0.1)
     if init == "mlp":
-        assert metrics["stages"]["field"]["seconds"] == pytest.approx(session.FIELD_SHARE * 8, abs=0.1)
+        assert metrics["results"]["field"]["seconds"] == pytest.approx(field_trainer.FIELD_SHARE * 8, abs=0.1)
 
 
 def test_shares_of_a_budget(tmp_path, tiny_scene, monkeypatch):
-    """100 seconds, 20 of them for the end; a phase that begins at 10 has 70 left, of which the field gets 30 percent."""
+    """100 seconds, 20 of them for the end; a phase that begins at 10 has 70 left, of which it takes its share."""
     monkeypatch.setattr(session.Run, "_time_to_finish", lambda self, phase=None: 20.0)
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 13.5)
-    for most, share in ((75.0, 21.0), (7.0, 7.0)):
-        field = {**TINY["field"], "time_budget": most}
-        config = settings(tiny_scene, tmp_path, init="mlp", time_budget=100.0, field=field)
-        run = session.Run(config, session.Clock(0.0, 0.0), None)
-        run.phase_started = 10.0
-        assert run.progress(Pretended("field")) == pytest.approx(3.5 / share)
-        assert run.progress(Pretended("octree")) == pytest.approx(3.5 / 70)
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
+    run.phase_started = 10.0
+    for share in (1.0, 0.3):
+        assert run.progress(Pretended("octree", share)) == pytest.approx(3.5 / (share * 70))
+
+
+def test_a_field_leaves_most_of_the_time_to_the_octree(tiny_scene):
+    """At most its own bound, and never so much that nothing is left."""
+    field = FieldTrainer(load_dataset(tiny_scene), FieldConfig(time_budget=7.0))
+    assert field.share_of(1000.0) == 7.0 and 0 < field.share_of(10.0) < 5.0
 
 
 def test_a_budget_ends_early_where_more_steps_would_overfit(tmp_path, tiny_scene, monkeypatch):
     """Progress is the share of the time or of the most steps, whichever is further."""
     monkeypatch.setattr(session.Run, "_time_to_finish", lambda self, phase=None: 0.0)
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 30.0)
-    run = session.Run(settings(tiny_scene, tmp_path, time_budget=100.0), session.Clock(0.0, 0.0), None)
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
     octree = Pretended("octree")
     for steps, progress in [(0, 0.3), (299, 0.3), (500, 0.5), (1000, 1.0)]:
         octree.steps_done = steps
@@ -61,8 +70,8 @@ def test_a_budget_ends_early_where_more_steps_would_overfit(tmp_path, tiny_scene
 def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
     """By a clock that goes on a second at every look, with a picture that takes 10 more, on one thread.
 
-    Reading took one second. A view takes one second to score, and to render a guess of 0.1 microseconds a pixel before there
-    is a picture and 11 seconds then. Two views are held out; a tenth is added for what else they need.
+    A phase that says how long writing takes and draws slowly leaves that much less for training: each held-out view is
+    drawn and scored once, and read again where it was released.
     """
     seconds = [0.0]
 
@@ -73,41 +82,43 @@ def test_time_is_kept_to_score_every_view(tmp_path, tiny_scene, monkeypatch):
     def picture(camera):
         seconds[0] += 10
 
-    monkeypatch.setattr(session, "HELD_OUT_KEPT", 0)
     monkeypatch.setattr(session.time, "perf_counter", look)
-    main.set_threads(1)
-    run = session.Run(settings(tiny_scene, tmp_path, time_budget=1000.0), session.Clock(0.0, 0.0), None)
-    assert "images" not in vars(run.held_out) and len(run.comparison_views) == 2
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0)
-    writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 1_000_000
-    octree = Pretended("octree")
-    assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 1 - 2.2 * (1 + 1600e-7))
-    octree.picture, octree.stage, octree.trainer, octree.n_leaves = picture, 0, Pretended("trainer"), 3_000_000
-    octree.n_vertices = 4_000_000
-    octree.trainer.bank = None
-    run.enter_stage(octree)
-    writing = session.FINISH_SECONDS + session.FINISH_SECONDS_PER_LEAF * 3_000_000
-    assert 100 / run.progress(octree) == pytest.approx(1000 - writing - 1 - 2.2 * (1 + 11))
+    set_threads(1)
+
+    def time_left(kept: int, writing: float) -> float:
+        monkeypatch.setattr(prepare, "HELD_OUT_KEPT", kept)
+        run = run_of(settings(tiny_scene, tmp_path, time_budget=1000.0))
+        assert len(run.data.held_out) == 2
+        phase = Pretended("octree", writing=writing)
+        phase.picture = picture
+        run.enter_stage(phase)
+        return 100 / run.progress(phase)
+
+    plain = time_left(1 << 30, 0.0)
+    assert plain < 1000 - 2 * (10 + 1)  # two views to draw and score
+    assert time_left(1 << 30, 5.0) == pytest.approx(plain - 5)
+    assert time_left(0, 0.0) == pytest.approx(plain - 1)  # to read them again
 
 
-def test_memory_is_announced_anew_where_the_octree_outgrows_the_estimate(tmp_path, tiny_scene, capsys):
+def test_memory_is_announced_again_where_the_octree_outgrows_the_estimate(tmp_path, tiny_scene, capsys):
     """With the vertices that it has; once for each larger octree, and not for one that is as large as was said."""
-    run = session.Run(settings(tiny_scene, tmp_path), session.Clock(0.0, 0.0), None)
-    said = int(re.search(r"up to ([\d,]+) leaves", capsys.readouterr().out)[1].replace(",", ""))
-    octree = Pretended("octree")
-    octree.stage, octree.trainer = 0, Pretended("trainer")
-    octree.trainer.bank = None
-    for leaves, vertices, reckoned in [(said, 1, None), (said + 1, 10**6, said + 1), (said + 1, 10**6, None),
-                                       (10**6, 2 * 10**6, 10**6)]:  # fmt: skip
+    run = run_of(settings(tiny_scene, tmp_path))
+    plan = OctreePlan(run.config, run.data.training, 0)
+    said = int(re.search(r"up to ([\d,]+) leaves", plan.sentence())[1].replace(",", ""))
+    octree = SimpleNamespace(n_leaves=said, n_vertices=1)
+    assert plan.outgrown(octree) is None
+    for leaves, vertices in [(said + 1, 10**6), (10**6, 2 * 10**6)]:
         octree.n_leaves, octree.n_vertices = leaves, vertices
-        run.enter_stage(octree)
-        printed = capsys.readouterr().out
-        if reckoned is None:
-            assert printed == ""
-        else:
-            estimate = estimate_training(run.dataset, reckoned, 1, run._beside, vertices)
-            assert printed == f"memory: the octree is larger than was reckoned with; now {estimate.sentence()}\n"
-            assert estimate.octree == octree_bytes(leaves, 1, vertices)
+        sentence = plan.outgrown(octree)
+        assert sentence.startswith("memory: the octree outgrew the estimate; now ") and f"{leaves:,} leaves" in sentence
+        assert gib(octree_bytes(leaves, 1, vertices)) in sentence
+        assert plan.outgrown(octree) is None
+    phase = Pretended("octree", sentence="memory: more")
+    phase.picture = lambda camera: None
+    capsys.readouterr()
+    run.enter_stage(phase)
+    assert capsys.readouterr().out == "memory: more\n"
 
 
 def test_a_budget_is_kept(tmp_path, tiny_scene):
@@ -134,9 +145,16 @@ def test_the_time_of_earlier_sessions_counts(tmp_path, tiny_scene):
 
 def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
     """12 pictures of 25 tiles, of which those that show the sphere count."""
-    run = session.Run(settings(tiny_scene, tmp_path, time_budget=100.0), session.Clock(0.0, 0.0), None)
-    assert run.rich_tiles == pytest.approx(300 * run._beside.rich_share) and 100 < run.rich_tiles <= 300
-    drawn = run.config.octree.tiles[-1] * run.config.octree.rich_share
-    for epochs, steps in [(1e4, 1e4 * run.rich_tiles / drawn), (1.0, train.FEWEST_STEPS)]:
-        run.config.octree.most_epochs = epochs
-        assert OctreePhase(run, None).most_steps == pytest.approx(steps)
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
+    plan = OctreePlan(run.config, run.data.training, 0)
+    assert 100 < plan.rich_tiles <= 300
+    octree = run.config.octree
+
+    def most_steps(epochs: float) -> float:
+        return OctreeTrainer(
+            run.data.training, (1, 1, 1), dataclasses.replace(octree, most_epochs=epochs), plan=plan
+        ).most_steps
+
+    drawn = octree.tiles[-1] * octree.rich_share
+    assert most_steps(1e4) == pytest.approx(1e4 * plan.rich_tiles / drawn)
+    assert most_steps(1.0) == most_steps(0.5) > 0  # however few the tiles

@@ -56,23 +56,23 @@ def test_learns_the_ball(dataset: Dataset, sampler: str) -> None:
     # What the samples of the very first step saw is noted; the importance sampler needs no grid.
     assert bool((trainer.grid.sigmas != untouched).any()) == (sampler == "occupancy")
     metrics += [trainer.step() for _ in range(config.steps - 1)]
-    assert metrics[0]["downscale"] == 4 and metrics[-1]["downscale"] == 2
+    assert metrics[0].downscale == 4 and metrics[-1].downscale == 2
     truth = np.concatenate([dataset.composited(i, (1, 1, 1)).reshape(-1, 3) for i in range(4)])
     constant = -10 * math.log10(((truth - truth.mean(0)) ** 2).mean())
-    assert np.mean([m["psnr"] for m in metrics[-10:]]) > constant + 6
+    assert np.mean([m.psnr for m in metrics[-10:]]) > constant + 6
     camera = dataset.cameras[0].scaled(2)
     o, d = (torch.from_numpy(a) for a in camera.rays())
     image = trainer.render(o, d, chunk=100)
-    np.testing.assert_allclose(trainer.render_camera(camera).reshape(-1, 3), image["rgb"], atol=1e-6)
+    np.testing.assert_allclose(trainer.picture(camera).reshape(-1, 3), image["rgb"], atol=1e-6)
     target = dataset.pyramid((1, 1, 1), 2)[0].reshape(-1, 3) / 255.0
     assert -10 * math.log10(((image["rgb"].numpy() - target) ** 2).mean()) > constant + 6
     inside = torch.from_numpy((target < 0.99).any(1))
     assert float(image["opacity"][inside].mean()) > 0.5 and float(image["opacity"][~inside].mean()) < 0.2
     if sampler == "occupancy":
         assert trainer.grid.fraction < 0.7
-        assert metrics[-1]["samples_per_ray"] < 0.5 * max(m["samples_per_ray"] for m in metrics[:20])
+        assert metrics[-1].samples < 0.5 * max(m.samples for m in metrics[:20])
     else:
-        assert metrics[-1]["samples_per_ray"] == 48
+        assert metrics[-1].samples == 48
 
 
 @pytest.mark.parametrize("extra", [{}, {"sampler": "importance"}, {"sparsity_weight": 0.01, "colour_weight": 0.03}])
@@ -80,18 +80,18 @@ def test_resumes_to_the_same_numbers(dataset: Dataset, tmp_path: Path, extra: di
     """Interrupted at step 11, through a checkpoint file, and on to the same weights bit for bit."""
     config = dataclasses.replace(TINY, steps=24, n_coarse=16, n_fine=16, **extra)
     whole = FieldTrainer(dataset, config, seed=3)
-    losses = [whole.step()["loss"] for _ in range(24)]
+    losses = [whole.step().loss for _ in range(24)]
     first = FieldTrainer(dataset, config, seed=3)
     for _ in range(11):
         first.step()
     save_checkpoint(tmp_path / "c.safetensors", first.state_dict())
     second = FieldTrainer(dataset, config, seed=3)
     second.load_state_dict(load_checkpoint(tmp_path / "c.safetensors"))
-    assert [second.step()["loss"] for _ in range(13)] == losses[11:]
+    assert [second.step().loss for _ in range(13)] == losses[11:]
     for mine, other in zip(second.field.parameters(), whole.field.parameters(), strict=True):
         assert torch.equal(mine, other)
     assert torch.equal(second.grid.sigmas, whole.grid.sigmas)
-    assert FieldTrainer(dataset, config, seed=4).step()["loss"] != losses[0]
+    assert FieldTrainer(dataset, config, seed=4).step().loss != losses[0]
 
 
 def test_a_checkpoint_of_another_network_is_refused(dataset: Dataset) -> None:

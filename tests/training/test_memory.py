@@ -133,14 +133,29 @@ def test_released_images_are_read_again(tiny_scene):
     dataset = load_dataset(tiny_scene, "train")
     before = [image.copy() for image in dataset.images]
     dataset.release()
-    assert "images" not in vars(dataset)
+    assert dataset.can_reload and dataset.nbytes == 0 and len(dataset.images) == len(dataset) and dataset.nbytes == 0
     assert all(np.array_equal(a, b) for a, b in zip(dataset.images, before, strict=True))
-    assert dataset.images is dataset.images  # and not once more for whoever asks next
+    assert dataset.nbytes == sum(image.nbytes for image in before)
+    assert dataset.images[0] is dataset.images[0]  # and not once more for whoever asks next
+    moved = dataclasses.replace(dataset, scene=dataset.scene)
+    moved.release()  # the images of both, and both can read them again
+    assert dataset.nbytes == 0 and np.array_equal(dataset.images[3], before[3]) and moved.nbytes > 0
     part = dataclasses.replace(dataset, images=dataset.images[:2])
     part.release()  # its images are not those of the files: it keeps them
-    assert len(part.images) == 2
-    with pytest.raises(AttributeError, match="no attribute 'pictures'"):
-        dataset.pictures  # noqa: B018
+    assert len(part.images) == 2 and not part.can_reload and part.nbytes > 0
+
+
+def test_released_images_give_their_memory_back(tmp_path):
+    """tracemalloc sees numpy's memory. The store held the only references."""
+    write_scene(tmp_path, {"train": 8, "val": 1}, size=120)
+    tracemalloc.start()
+    try:
+        dataset = load_dataset(tmp_path, "train")
+        held, nbytes = tracemalloc.get_traced_memory()[0], dataset.nbytes
+        dataset.release()
+        assert held - tracemalloc.get_traced_memory()[0] > 0.99 * nbytes == 0.99 * 8 * 120 * 120 * 4
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_pyramid_level_need_not_stand_beside_what_is_made_of_it(dataset):

@@ -212,7 +212,7 @@ def test_terms_of_the_loss_fade_and_smoothness_waits(tiny_scene, monkeypatch):
     trainer = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
     for progress in (0.0, 0.5, 0.5, 1.0):
         trainer.step(progress)
-    found = [(o.colour, o.distortion, o.smooth_density, o.smooth_colour) for o in seen]
+    found = [(o.colour, o.distortion, o.tv_density, o.tv_sh) for o in seen]
     expected = [(0.5, 0.25, 0, 0), (0.05, 0.025, 0, 0), (0.05, 0.025, 0.1, 0.2), (0.005, 0.0025, 0.01, 0.02)]
     assert np.allclose(found, expected, rtol=1e-12, atol=0)
 

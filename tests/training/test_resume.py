@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import nerfvol
-from nerfvol.cli import main
+from nerfvol.cli.command import set_threads
+from nerfvol.cli.target import open_target
 from nerfvol.config.assemble import assemble, run_settings
 from nerfvol.config.training import Config
 from nerfvol.errors import InputError
@@ -23,7 +24,7 @@ from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.octree.io import load_octree
 from nerfvol.training import session
-from tests.fixtures.runs import TINY, log_of, metrics_of, product, settings, start
+from tests.fixtures.runs import TINY, log_of, metrics_of, product, run_of, settings, start
 
 ROOT = Path(nerfvol.__file__).parents[1]
 
@@ -63,7 +64,7 @@ def test_resumed_anywhere_the_octree_is_the_same(whole, tmp_path, tiny_scene):
         stages[phase, step] = (state.get("stage"), state.get("prunings"), len(state.get("node_mask", [])))
     keys = list(whole.checkpoints)
     changes = [i for i in range(1, len(keys)) if stages[keys[i]] != stages[keys[i - 1]]]
-    assert {(phase, 0) for phase, _ in keys} <= set(keys)  # each phase begins with one
+    assert {(phase, 1) for phase, _ in keys} <= set(keys)  # each phase has one from its first step on
     assert {stages[key][0] for key in keys if key[0] == "octree"} >= {1, 2}  # a distilled octree skips the first stage
     wanted = {0, len(keys) - 1, 7, *changes, *(i - 1 for i in changes)}
     init = load_config(whole.run)["init"]
@@ -76,7 +77,7 @@ def test_resumed_anywhere_the_octree_is_the_same(whole, tmp_path, tiny_scene):
         start(settings(tiny_scene, out, init=init, resume=True, checkpoint_every=1000))
         assert product(out) == product(whole.run), f"resumed at step {step} of the {phase}"
         assert metrics_of(out)["steps"] == metrics_of(whole.run)["steps"]
-        assert list(metrics_of(out)["stages"]) == list(metrics_of(whole.run)["stages"])
+        assert list(metrics_of(out)["results"]) == list(metrics_of(whole.run)["results"])
 
 
 def load_config(run: Path) -> dict:
@@ -88,7 +89,7 @@ def test_threads_change_nothing(whole, tmp_path, tiny_scene):
     try:
         run = start(settings(tiny_scene, tmp_path / "two", init=init, threads=2, checkpoint_every=1000))
     finally:
-        main.set_threads(1)
+        set_threads(1)
     assert product(run) == product(whole.run)
 
 
@@ -118,16 +119,14 @@ def test_records(whole, command):
     assert metrics["leaves"] == load_octree(whole.run / run_folder.OCTREE)[0].n_leaves
     assert metrics["steps"]["octree"] == 60 and metrics["MB"] > 0 and metrics["vertices"] > metrics["leaves"]
     mlp = metrics["init"] == "mlp"
-    assert list(metrics["stages"]) == (["field", "distilled", "fine_tuned"] if mlp else [])
-    for row in metrics["stages"].values():
+    assert list(metrics["results"]) == (["field", "distilled", "fine_tuned"] if mlp else [])
+    for row in metrics["results"].values():
         assert {"psnr", "ssim", "seconds", "leaves", "MB", "seconds_per_frame"} <= row.keys()
     assert (whole.run / run_folder.DISTILLED).exists() == mlp
     names = {path.name for path in (whole.run / run_folder.PREVIEWS).iterdir()}
     assert {"octree_010.png", "octree_100.png"} <= names and ("field_100.png" in names) == mlp
     assert not [path.name for path in whole.run.iterdir() if ".tmp" in path.name]
-    from nerfvol.cli.target import find_orbit
-
-    orbit = find_orbit("nowhere", *load_octree(whole.run / run_folder.OCTREE))
+    orbit = open_target(str(whole.run / run_folder.OCTREE)).orbit()
     assert orbit["radius"] == pytest.approx(3.2, rel=0.05) and orbit["center"] == pytest.approx([0, 0, 0], abs=0.05)
 
 
@@ -137,7 +136,7 @@ def test_training_gains(whole):
     if metrics["init"] == "direct":
         assert metrics["psnr"] > 18  # a white picture scores 12
     else:
-        assert metrics["stages"]["fine_tuned"]["psnr"] > metrics["stages"]["distilled"]["psnr"] + 1
+        assert metrics["results"]["fine_tuned"]["psnr"] > metrics["results"]["distilled"]["psnr"] + 1
 
 
 def test_a_finished_run_says_so(whole, command):
@@ -176,8 +175,8 @@ def test_clock_and_running_error_go_on_where_the_checkpoint_left_them(whole, tmp
     assert last["step"] == 60 and 3e8 < last["seconds"] < metrics["seconds"] < 3.1e8
     new_share = 1 - session.RUNNING**5  # of the five steps' errors, each below 1
     assert 10 ** (-last["psnr"] / 10) == pytest.approx(1 - new_share, abs=new_share)
-    if metrics["stages"]:
-        assert 1e8 < metrics["stages"]["fine_tuned"]["seconds"] < 1.1e8
+    if metrics["results"]:
+        assert 1e8 < metrics["results"]["fine_tuned"]["seconds"] < 1.1e8
 
 
 @pytest.mark.parametrize("change", [
@@ -191,7 +190,7 @@ def test_a_checkpoint_whose_parts_do_not_fit_is_refused(whole, tmp_path, tiny_sc
 
 
 def test_a_run_outside_the_main_thread_leaves_signals_alone(tmp_path, tiny_scene):
-    run = session.Run(settings(tiny_scene, tmp_path), session.Clock(None, 0.0), None)
+    run = run_of(settings(tiny_scene, tmp_path))
     handler, seen = signal.getsignal(signal.SIGINT), []
 
     def work():
@@ -228,7 +227,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path, tiny_scene, command, monke
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path, tiny_scene):
-    run = session.Run(settings(tiny_scene, tmp_path), session.Clock(None, 0.0), None)
+    run = run_of(settings(tiny_scene, tmp_path))
     with run.interruptible():
         os.kill(os.getpid(), signal.SIGINT)
         assert run.interrupted

@@ -1,5 +1,6 @@
 """The training run: memory let go on the way, errors, what cannot be used, a real scene."""
 
+import dataclasses
 import gc
 import json
 import os
@@ -12,9 +13,11 @@ import pytest
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
-from nerfvol.training import session, train
-from nerfvol.training.prepare import prepare_run
-from tests.fixtures.runs import TINY, Pretended, log_of, settings, start
+from nerfvol.training import prepare, session, train
+from nerfvol.training.octree_trainer import OctreeTrainer
+from nerfvol.training.prepare import claim_folder
+from nerfvol.views import OctreeModel
+from tests.fixtures.runs import TINY, Pretended, log_of, run_of, settings, start
 from tests.fixtures.tiny import write_scene
 
 
@@ -30,7 +33,7 @@ def test_the_pictures_are_let_go_once_they_are_in_tiles(
 
     def look(self, phase, error):
         follow(self, phase, error)
-        held.append((phase.stage, "images" in vars(self.dataset)))
+        held.append((phase.stage, "images" in vars(self.data.training)))
 
     monkeypatch.setattr(session.Run, "follow", look)
     octree = {**TINY["octree"], "downscales": downscales}
@@ -41,19 +44,19 @@ def test_the_pictures_are_let_go_once_they_are_in_tiles(
 
 
 def test_nothing_of_training_is_held_while_the_result_is_scored(tmp_path, tiny_scene, monkeypatch):
-    trained, save, load = [], train.save_octree, train.load_octree
+    trained, save, load = [], OctreeModel.save, train.load_model
 
-    def watch(path, octree, *rest):
-        trained.append(weakref.ref(octree))
-        return save(path, octree, *rest)
+    def watch(self, *rest):
+        trained.append(weakref.ref(self.octree))
+        return save(self, *rest)
 
     def look(path):
         gc.collect()
         assert trained[-1]() is None
         return load(path)
 
-    monkeypatch.setattr(train, "save_octree", watch)
-    monkeypatch.setattr(train, "load_octree", look)
+    monkeypatch.setattr(OctreeModel, "save", watch)
+    monkeypatch.setattr(train, "load_model", look)
     start(settings(tiny_scene, tmp_path))
     assert len(trained) == 1
 
@@ -61,7 +64,7 @@ def test_nothing_of_training_is_held_while_the_result_is_scored(tmp_path, tiny_s
 # ---------------------------------------------------------------- what cannot be used
 def test_a_resumed_run_keeps_its_settings(tmp_path, tiny_scene, command):
     config = settings(tiny_scene, tmp_path)
-    prepare_run(config)
+    claim_folder(config)
     save_checkpoint(tmp_path / run_folder.CHECKPOINT, {"phase": "start"})
     before = (tmp_path / run_folder.CONFIG).read_text()
     code, _, err = command("train", "--resume", "--out", tmp_path, "--set", "octree.sh_degree=2")
@@ -75,11 +78,11 @@ def test_a_resumed_run_keeps_its_settings(tmp_path, tiny_scene, command):
     {}, {"phase": "octree"}, {"phase": "lunch", "steps": 3}, {"phase": "done"},
     {"phase": "octree", "trainer": {"values": np.zeros(3)}}, {"phase": ["octree"]}, {"phase": "octree", "trainer": 3},
     {"phase": "octree", "trainer": {}, "elapsed": "long"}, {"phase": "field", "trainer": {}, "log_bytes": 0.5},
-    {"phase": "octree", "trainer": {}, "stages": []}, {"phase": "octree", "trainer": {}, "running": None},
+    {"phase": "octree", "trainer": {}, "results": []}, {"phase": "octree", "trainer": {}, "running": None},
 ])  # fmt: skip
 def test_a_foreign_checkpoint_is_one_sentence(tmp_path, tiny_scene, command, state):
-    prepare_run(settings(tiny_scene, tmp_path))
-    filled = {"elapsed": 0.0, "log_bytes": 0, "stages": {}, "steps": {}, "phase_started": 0.0, "running": 0.1}
+    claim_folder(settings(tiny_scene, tmp_path))
+    filled = {"elapsed": 0.0, "log_bytes": 0, "results": {}, "steps": {}, "phase_started": 0.0, "running": 0.1}
     save_checkpoint(tmp_path / run_folder.CHECKPOINT, {**filled, **state} if "trainer" in state else state)
     code, _, err = command("train", "--resume", "--out", tmp_path)
     assert code == 2 and str(tmp_path / run_folder.CHECKPOINT) in err and err.count("\n") == 1, err
@@ -94,7 +97,7 @@ def test_a_scene_of_nothing_is_said_at_once(tmp_path):
         write_png(path, np.ones((24, 24, 3)))
     with pytest.raises(InputError, match="the training images are empty.*--background"):
         start(settings(scene, tmp_path / "run"))
-    assert session.Run(settings(scene, tmp_path, background="black"), session.Clock(0.0, 0.0), None).dataset
+    assert run_of(settings(scene, tmp_path, background="black")).data.training
 
 
 @pytest.mark.parametrize("init, section, more", [
@@ -110,20 +113,20 @@ def test_a_collapse_is_said_early(tmp_path, tiny_scene, init, section, more):
 
 @pytest.mark.parametrize("error", ["nan", "inf"])
 def test_divergence_does_not_reach_a_checkpoint(tmp_path, tiny_scene, monkeypatch, error):
-    step = train.OctreePhase.step
+    step = OctreeTrainer.step
 
     def explode(self, progress):
-        found, samples = step(self, progress)
-        return (float(error) if self.steps_done == 6 else found), samples
+        report = step(self, progress)
+        return dataclasses.replace(report, squared_error=float(error)) if self.steps_done == 6 else report
 
-    monkeypatch.setattr(train.OctreePhase, "step", explode)
+    monkeypatch.setattr(OctreeTrainer, "step", explode)
     with pytest.raises(InputError, match=f"diverged at step 6.*error is {error}.*learning rates"):
         start(settings(tiny_scene, tmp_path))
-    assert load_checkpoint(tmp_path / run_folder.CHECKPOINT)["trainer"]["step_count"] == 5
+    assert load_checkpoint(tmp_path / run_folder.CHECKPOINT)["trainer"]["steps_done"] == 5
 
 
 def test_the_running_error_follows_slowly(tmp_path, tiny_scene):
-    run, phase = session.Run(settings(tiny_scene, tmp_path), session.Clock(None, 0.0), None), Pretended("octree")
+    run, phase = run_of(settings(tiny_scene, tmp_path)), Pretended("octree")
     phase.steps_done = 1
     for error, running in ((1.0, 1.0), (0.0, 0.98), (0.5, 0.98**2 + 0.01)):
         run.follow(phase, error)
@@ -133,9 +136,9 @@ def test_the_running_error_follows_slowly(tmp_path, tiny_scene):
 def test_fields_and_octrees_are_compared_on_parts_of_views(tmp_path, tiny_scene, monkeypatch):
     """A field renders slowly."""
     for most, size in [(200, 40), (40, 40), (13, 13)]:
-        monkeypatch.setattr(session, "COMPARED_SIZE", most)
-        run = session.Run(settings(tiny_scene, tmp_path, compare_views=1), session.Clock(0.0, 0.0), None)
-        (camera,), (image,) = run.comparison_views.cameras, run.comparison_views.images
+        monkeypatch.setattr(prepare, "COMPARED_SIZE", most)
+        run = run_of(settings(tiny_scene, tmp_path, compare_views=1))
+        (camera,), (image,) = run.data.compared.cameras, run.data.compared.images
         assert image.shape[:2] == (size, size) and camera.intrinsics.width == size
 
 
@@ -160,7 +163,7 @@ def test_lego_small(tmp_path, init, command):
     metrics = json.loads((tmp_path / "run" / run_folder.METRICS).read_text())
     assert metrics["psnr"] > 20 and metrics["image_size"] == [100, 100]  # a white picture scores 9.8
     if init == "mlp":
-        rows = metrics["stages"]
+        rows = metrics["results"]
         assert rows["fine_tuned"]["psnr"] > rows["distilled"]["psnr"] > 12
     code, *_ = command("render", tmp_path / "run", "--orbit", 2, "--size", "50x50", "--out", tmp_path / "views")
     assert code == 0

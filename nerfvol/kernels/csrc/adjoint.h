@@ -146,7 +146,7 @@ struct Adjoint {
     float target[kTile][3], colour_weight[kTile], distortion_weight[kTile], error[kTile], ray_weight[kTile];
     float weight_sum[kTile], moment_sum[kTile];          // over all hits, for the distortion loss
     float weight_behind[kTile], moment_behind[kTile];
-    float smooth_density = 0, smooth_colour = 0;
+    float tv_density = 0, tv_sh = 0;
 };
 
 inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState<1>& s,
@@ -166,26 +166,27 @@ inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const R
 }
 
 inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t first, int n, Adjoint& a, StepReport& report) {
-    a.smooth_density = loss.smooth_density;
-    a.smooth_colour = loss.smooth_colour;
+    const nerfvol::LossOptions& o = loss.options;
+    a.tv_density = o.tv_density;
+    a.tv_sh = o.tv_sh;
     for (int l = 0; l < n; ++l) {
         const float* target = loss.target + 3 * (first + l);
         const float weight = loss.weight[first + l];
         float q = 0, error = 0, miss = 0;
         f4 g{};
         for (int k = 0; k < 3; ++k) {
-            const float residual = s.colour[l][k] + s.trans[l] * loss.background[k] - target[k];
-            const float d = loss.background[k] - target[k];
+            const float residual = s.colour[l][k] + s.trans[l] * o.background[k] - target[k];
+            const float d = o.background[k] - target[k];
             a.target[l][k] = target[k];
             error += residual * residual;
             miss += d * d;
             g[k] = 2 * weight * residual;
-            q += g[k] * loss.background[k];
+            q += g[k] * o.background[k];
         }
         a.colour[l] = g;
-        a.behind[l] = s.trans[l] * (q + weight * loss.colour * miss);
-        a.colour_weight[l] = weight * loss.colour;
-        a.distortion_weight[l] = weight * loss.distortion;
+        a.behind[l] = s.trans[l] * (q + weight * o.colour * miss);
+        a.colour_weight[l] = weight * o.colour;
+        a.distortion_weight[l] = weight * o.distortion;
         a.error[l] = weight * error;
         a.ray_weight[l] = weight;
         a.weight_sum[l] = 1 - s.trans[l];
@@ -196,16 +197,16 @@ inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t f
 }
 
 // Differences below these count by their squares, larger ones as they are: an edge of the scene is no worse than a slope.
-constexpr float kSmoothDensity = 1.0f, kSmoothColour = 0.1f;
+constexpr float kKneeDensity = 1.0f, kKneeSh = 0.1f;
 
 // Adds to the gradients of a leaf's corners that of their differences d along its edges, the sum of weight * (|d| - e log(1 +
 // |d| / e)) over edges and numbers of a vertex row: a total variation [Plenoxels] that is smooth at zero.
-template <int B> void smooth_corners(const Tree& tree, const int32_t* corners, float density, float colour, f16 (&gradient)[8][B]) {
-    const f4 rgb = {colour, colour, colour, colour}, knee = {kSmoothColour, kSmoothColour, kSmoothColour, kSmoothColour};
-    const f4 raw = {kSmoothDensity, kSmoothDensity, kSmoothDensity, kSmoothDensity};
+template <int B> void add_variation(const Tree& tree, const int32_t* corners, float density, float colour, f16 (&gradient)[8][B]) {
+    const f4 rgb = {colour, colour, colour, colour}, knee = {kKneeSh, kKneeSh, kKneeSh, kKneeSh};
+    const f4 raw = {kKneeDensity, kKneeDensity, kKneeDensity, kKneeDensity};
     for (int k = 0; k < B; ++k) {
         const f16 weight = k == 0 ? join(rgb, rgb, rgb, f4{density, 0, 0, 0}) : splat16(colour);
-        const f16 e = k == 0 ? join(knee, knee, knee, raw) : splat16(kSmoothColour);
+        const f16 e = k == 0 ? join(knee, knee, knee, raw) : splat16(kKneeSh);
         f16 value[8];
         for (int o = 0; o < 8; ++o) value[o] = load<f16>(tree.values + 16 * (B * int64_t(corners[o]) + k));
         for (int axis = 1; axis < 8; axis *= 2)
@@ -223,7 +224,7 @@ template <int B>
 void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& work, Adjoint& a, VertexTable& table,
                      VertexGradients& gradients) {
     const float per_length = 1.0f / tree.size;
-    const bool smooths = a.smooth_density > 0 || a.smooth_colour > 0;
+    const bool with_variation = a.tv_density > 0 || a.tv_sh > 0;
     for (int l = 0; l < kTile; ++l) a.weight_behind[l] = a.moment_behind[l] = 0;
     gradients.start(8 * work.visits.size(), 16 * B);
     table.start(8 * work.visits.size());
@@ -270,9 +271,9 @@ void backward_packet(const Tree& tree, const BasisRows<B>& basis, Workspace& wor
             }
         }
         const int32_t* corners = tree.corners + 8 * int64_t(visit.leaf);
-        if (smooths) {
+        if (with_variation) {
             const float sides = crossed * per_length / visit.side;
-            smooth_corners<B>(tree, corners, a.smooth_density * sides, a.smooth_colour * sides, corner);
+            add_variation<B>(tree, corners, a.tv_density * sides, a.tv_sh * sides, corner);
         }
         for (int o = 0; o < 8; ++o) table.add(corners[o], corner[o], gradients);
     }

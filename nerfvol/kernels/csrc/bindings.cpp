@@ -1,15 +1,19 @@
 // Python bindings. Shapes and ranges were checked by nerfvol/kernels/ops.py; types and layouts are checked here.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
+#include <array>
 #include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
+#include "arena.h"
 #include "batch.h"
 #include "pool.h"
 #include "topology.h"
@@ -122,32 +126,78 @@ void py_render_backward(const TreeArrays& t, Rows origins, Rows directions, std:
     const Cotangents cotangents{pointer(rgb), pointer(trans), pointer(depth)};
     const GradientSink sink{gradient.data(), nullptr, slots.data()};
     nb::gil_scoped_release release;
-    kernels().backward(t.tree, rays, options, &cotangents, nullptr, sink, {nullptr, nullptr, nullptr}, 1.0f);
+    kernels().backward(t.tree, rays, options, cotangents, sink);
 }
 
-// One training step. With `gradient` the dense gradient of the loss is added there and nothing else changes; without it the
-// optimiser updates values and moments.
-nb::tuple py_train_step(const TreeArrays& t, Rows origins, Rows directions, Rows target, In<float, nb::ndim<1>> weight,
-                        std::vector<float> background, float eps, float colour, float distortion,
-                        float smooth_density, float smooth_colour, float pixel_angle,
-                        Maybe<FloatRows> gradient, Maybe<FloatRows> values, Maybe<FloatRows> moments, std::vector<float> rates,
-                        float beta, float opt_eps, Out<int32_t, nb::ndim<1>> slots, Maybe<Floats> max_weight, Maybe<Floats> error,
-                        Maybe<Floats> footprint) {
-    const Rays rays = make_rays(origins, directions);
-    const RenderOptions options = make_options(background, eps);
-    const Loss loss{target.data(), weight.data(), {background[0], background[1], background[2]},
-                    colour, distortion, smooth_density, smooth_colour};
-    const Optimizer optimizer{pointer(values), pointer(moments), rates.at(0), rates.at(1), rates.at(2), beta, opt_eps};
-    if (!gradient && (!values || !moments || values->data() != t.tree.values))
-        throw std::invalid_argument("the optimiser needs the octree's own values and their moments");
-    const GradientSink sink{pointer(gradient), gradient ? nullptr : &optimizer, slots.data()};
-    const LeafStatistics statistics{pointer(max_weight), pointer(error), pointer(footprint)};
+// Holds the arrays of a batch for as long as the views of them are used.
+struct BatchArrays {
+    Rows origins, directions, target;
+    In<float, nb::ndim<1>> weight;
+
+    Rays rays() const { return make_rays(origins, directions); }
+    Loss loss(const LossOptions& options) const {
+        if (target.shape(0) != directions.shape(0) || weight.shape(0) != directions.shape(0))
+            throw std::invalid_argument("target and weight must have one row per ray");
+        return {target.data(), weight.data(), options};
+    }
+};
+
+struct StatisticsArrays {
+    Floats max_weight, error, footprint;
+    float pixel_angle;
+
+    LeafStatistics of(const TreeArrays& t) const {
+        for (const Floats* a : {&max_weight, &error, &footprint})
+            if (int64_t(a->shape(0)) != t.tree.n_leaves) throw std::invalid_argument("the statistics do not fit the leaves");
+        return {max_weight.data(), error.data(), footprint.data(), pixel_angle};
+    }
+};
+
+nb::tuple report_of(const StepReport& r) { return nb::make_tuple(r.squared_error, r.weight, r.samples); }
+
+// One step of the optimiser, which updates the octree's own values and the moments.
+nb::tuple py_train_step(const TreeArrays& t, const BatchArrays& batch, const LossOptions& options, const Rates& rates,
+                        FloatRows values, FloatRows moments, Out<int32_t, nb::ndim<1>> slots, const StatisticsArrays& statistics) {
+    if (values.data() != t.tree.values) throw std::invalid_argument("the optimiser needs the octree's own values");
+    const Rays rays = batch.rays();
+    const Loss loss = batch.loss(options);
+    const Optimizer optimizer{values.data(), moments.data(), rates};
+    const GradientSink sink{nullptr, &optimizer, slots.data()};
+    const LeafStatistics out = statistics.of(t);
     StepReport r;
     {
         nb::gil_scoped_release release;
-        r = kernels().backward(t.tree, rays, options, nullptr, &loss, sink, statistics, pixel_angle);
+        r = kernels().train_step(t.tree, rays, loss, sink, out);
     }
-    return nb::make_tuple(r.squared_error, r.weight, r.samples);
+    return report_of(r);
+}
+
+// Adds the loss's gradient to `gradient`; nothing else changes.
+nb::tuple py_loss_gradient(const TreeArrays& t, const BatchArrays& batch, const LossOptions& options, FloatRows gradient,
+                           Out<int32_t, nb::ndim<1>> slots) {
+    const Rays rays = batch.rays();
+    const Loss loss = batch.loss(options);
+    const GradientSink sink{gradient.data(), nullptr, slots.data()};
+    StepReport r;
+    {
+        nb::gil_scoped_release release;
+        r = kernels().train_step(t.tree, rays, loss, sink, LeafStatistics{});
+    }
+    return report_of(r);
+}
+
+// A step that moves nothing: what the rays say of the leaves.
+nb::tuple py_leaf_statistics(const TreeArrays& t, const BatchArrays& batch, const LossOptions& options,
+                             const StatisticsArrays& statistics) {
+    const Rays rays = batch.rays();
+    const Loss loss = batch.loss(options);
+    const LeafStatistics out = statistics.of(t);
+    StepReport r;
+    {
+        nb::gil_scoped_release release;
+        r = kernels().leaf_statistics(t.tree, rays, loss, out);
+    }
+    return report_of(r);
 }
 
 int64_t py_number_corners(In<int8_t, nb::ndim<1>> level, In<int32_t, nb::shape<-1, 3>> ijk, int max_level,
@@ -208,6 +258,43 @@ void py_gather_tiles(const std::vector<In<float, nb::shape<-1, 64, 3>>>& directi
     gather_tiles(from, image.data(), tile.data(), row.data(), n, out.data(), target.data());
 }
 
+// What training takes, by name: a term of the loss is one field here, of tree.h's LossOptions and of Python's.
+void bind_training(nb::module_& m) {
+    nb::class_<LossOptions>(m, "LossOptions")
+        .def(nb::init<>())
+        .def_prop_rw(
+            "background", [](const LossOptions& o) { return std::array<float, 3>{o.background[0], o.background[1], o.background[2]}; },
+            [](LossOptions& o, const std::array<float, 3>& rgb) { std::copy(rgb.begin(), rgb.end(), o.background); })
+        .def_rw("early_stop_eps", &LossOptions::early_stop_eps)
+        .def_rw("colour", &LossOptions::colour)
+        .def_rw("distortion", &LossOptions::distortion)
+        .def_rw("tv_density", &LossOptions::tv_density)
+        .def_rw("tv_sh", &LossOptions::tv_sh);
+    nb::class_<Rates>(m, "Rates")
+        .def(nb::init<>())
+        .def_rw("density", &Rates::density)
+        .def_rw("dc", &Rates::dc)
+        .def_rw("sh", &Rates::sh)
+        .def_rw("beta", &Rates::beta)
+        .def_rw("eps", &Rates::eps);
+    nb::class_<BatchArrays>(m, "Batch").def(
+        "__init__", [](BatchArrays* self, Rows o, Rows d, Rows target, In<float, nb::ndim<1>> weight) {
+            new (self) BatchArrays{o, d, target, weight};
+        },
+        nb::kw_only(), "rays_o"_a, "rays_d"_a, "target"_a, "weight"_a);
+    nb::class_<StatisticsArrays>(m, "LeafStatistics").def(
+        "__init__", [](StatisticsArrays* self, Floats max_weight, Floats error, Floats footprint, float pixel_angle) {
+            new (self) StatisticsArrays{max_weight, error, footprint, pixel_angle};
+        },
+        nb::kw_only(), "max_weight"_a, "error"_a, "footprint"_a, "pixel_angle"_a);
+    m.def("train_step", &py_train_step, "tree"_a, "batch"_a, "options"_a, "rates"_a, nb::kw_only(), "values"_a, "moments"_a,
+          "slots"_a, "statistics"_a);
+    m.def("loss_gradient", &py_loss_gradient, "tree"_a, "batch"_a, "options"_a, nb::kw_only(), "gradient"_a, "slots"_a);
+    m.def("leaf_statistics", &py_leaf_statistics, "tree"_a, "batch"_a, "options"_a, nb::kw_only(), "statistics"_a);
+    m.def("arena_bytes", &arena_bytes, nb::call_guard<nb::gil_scoped_release>());
+    m.def("release_arenas", &release_arenas, nb::call_guard<nb::gil_scoped_release>());
+}
+
 }  // namespace
 
 NB_MODULE(_nerfvol_kernels, m) {
@@ -225,11 +312,7 @@ NB_MODULE(_nerfvol_kernels, m) {
           "normal"_a.none());
     m.def("render_backward", &py_render_backward, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a,
           "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "gradient"_a, "slots"_a);
-    m.def("train_step", &py_train_step, "tree"_a, "rays_o"_a, "rays_d"_a, "target"_a, "weight"_a, "background"_a,
-          "early_stop_eps"_a, "colour"_a, "distortion"_a, "smooth_density"_a, "smooth_colour"_a, "pixel_angle"_a,
-          "gradient"_a.none(), "values"_a.none(), "moments"_a.none(), "rates"_a, "beta"_a, "eps"_a, "slots"_a,
-          "max_weight"_a.none(), "error"_a.none(),
-          "footprint"_a.none());
+    bind_training(m);
     m.def("number_corners", &py_number_corners, "level"_a, "ijk"_a, "max_level"_a, "ids"_a);
     m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);
     m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);

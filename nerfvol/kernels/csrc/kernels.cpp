@@ -4,5 +4,5 @@
 
 namespace NERFVOL_ISA {
 extern const nerfvol::Kernels table;
-const nerfvol::Kernels table = {render, render_view, backward};
+const nerfvol::Kernels table = {render, render_view, backward, train_step, leaf_statistics};
 }  // namespace NERFVOL_ISA

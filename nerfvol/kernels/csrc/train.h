@@ -6,45 +6,20 @@
 // The order of every sum is fixed by the batch, so the result is the same to the last bit for any number of threads.
 #pragma once
 #include <algorithm>
-#include <deque>
-#include <memory>
-#include <mutex>
 
 #include "adjoint.h"
+#include "arena.h"
 
 namespace NERFVOL_ISA {
 
+using nerfvol::Arena;
+using nerfvol::Arenas;
 using nerfvol::GradientSink;
 using nerfvol::kBuckets;
 using nerfvol::LeafStatistics;
 using nerfvol::Optimizer;
 
-// Memory that is taken piece by piece and given back all at once: what one thread's packets leave to phase 2. Kept between
-// steps, it is as large as the largest step was; had each packet memory of its own, that would be as large as its largest.
-class Arena {
-public:
-    template <class T> T* take(size_t n) {
-        const size_t bytes = (n * sizeof(T) + 63) & ~size_t(63);
-        while (block_ < blocks_.size() && used_ + bytes > blocks_[block_].size) { ++block_; used_ = 0; }
-        if (block_ == blocks_.size()) blocks_.emplace_back(std::max(bytes, kBlock));
-        used_ += bytes;
-        return reinterpret_cast<T*>(blocks_[block_].bytes.get() + used_ - bytes);
-    }
-    void clear() { block_ = used_ = 0; }
-
-private:
-    static constexpr size_t kBlock = size_t(4) << 20;
-    struct Block {
-        explicit Block(size_t n) : bytes(new (std::align_val_t{64}) char[n]), size(n) {}
-        struct Free {
-            void operator()(char* p) const { ::operator delete[](p, std::align_val_t{64}); }
-        };
-        std::unique_ptr<char[], Free> bytes;
-        size_t size;
-    };
-    std::vector<Block> blocks_;
-    size_t block_ = 0, used_ = 0;  // where the next piece begins
-};
+template <class T> T* take(Arena& arena, size_t n) { return static_cast<T*>(arena.take(n * sizeof(T))); }
 
 // What phase 1 leaves of one packet, in an arena.
 struct PacketRecord {
@@ -71,21 +46,22 @@ template <class BucketOf, class Place> void sort_by_bucket(size_t n, int32_t* fi
     for (size_t i = 0; i < n; ++i) place(i, size_t(at[bucket_of(i)]++));
 }
 
-template <int B>
-void group_by_bucket(const Tree& tree, int shift, const VertexGradients& gradients, const std::vector<Visit>& visits, Arena& arena,
-                     PacketRecord& rec) {
+template <int B> void group_rows(int shift, const VertexGradients& gradients, Arena& arena, PacketRecord& rec) {
     const std::vector<int32_t>& met = gradients.vertices;
-    int32_t* vertices = arena.take<int32_t>(met.size());
-    float* rows = arena.take<float>(16 * B * met.size());
+    int32_t* vertices = take<int32_t>(arena, met.size());
+    float* rows = take<float>(arena, 16 * B * met.size());
     sort_by_bucket(met.size(), rec.first_row, [&](size_t i) { return met[i] >> shift; }, [&](size_t i, size_t to) {
         vertices[to] = met[i];
         for (int k = 0; k < B; ++k) store(rows + 16 * (B * to + k), load<f16>(gradients.row(i) + 16 * k));
     });
-    Visit* by_bucket = arena.take<Visit>(visits.size());
-    sort_by_bucket(visits.size(), rec.first_visit, [&](size_t i) { return tree.corners[8 * int64_t(visits[i].leaf)] >> shift; },
-                   [&](size_t i, size_t to) { by_bucket[to] = visits[i]; });
     rec.vertices = vertices;
     rec.rows = rows;
+}
+
+inline void group_visits(const Tree& tree, int shift, const std::vector<Visit>& visits, Arena& arena, PacketRecord& rec) {
+    Visit* by_bucket = take<Visit>(arena, visits.size());
+    sort_by_bucket(visits.size(), rec.first_visit, [&](size_t i) { return tree.corners[8 * int64_t(visits[i].leaf)] >> shift; },
+                   [&](size_t i, size_t to) { by_bucket[to] = visits[i]; });
     rec.visits = by_bucket;
 }
 
@@ -115,12 +91,11 @@ template <int B> void prefetch_rows(const PacketRecord& rec, int bucket, const i
 
 template <int B> void apply(const GradientSink& sink, const VertexGradients& sums) {
     const size_t n = sums.vertices.size();
-    const float dc = sink.optimizer ? sink.optimizer->rate_dc : 0, sh = sink.optimizer ? sink.optimizer->rate_sh : 0;
-    const float density = sink.optimizer ? sink.optimizer->rate_density : 0;
+    const nerfvol::Rates rates = sink.optimizer ? sink.optimizer->rates : nerfvol::Rates{};
     f16 rate[B];
-    for (int k = 0; k < B; ++k) rate[k] = splat16(sh);
-    const f4 channel = {dc, sh, sh, sh};
-    rate[0] = join(channel, channel, channel, f4{density, 0, 0, 0});
+    for (int k = 0; k < B; ++k) rate[k] = splat16(rates.sh);
+    const f4 channel = {rates.dc, rates.sh, rates.sh, rates.sh};
+    rate[0] = join(channel, channel, channel, f4{rates.density, 0, 0, 0});
     for (size_t i = 0; i < n; ++i) {
         const int32_t vertex = sums.vertices[i];
         const int64_t at = 16 * B * int64_t(vertex);
@@ -141,10 +116,10 @@ template <int B> void apply(const GradientSink& sink, const VertexGradients& sum
             float* moment = opt.moments + at + 16 * k;
             float* value = opt.values + at + 16 * k;
             const f16 old = load<f16>(moment), g2 = g * g;
-            const f16 m = select_less(-old, 0.0f, old * opt.beta + g2 * (1 - opt.beta), g2);
+            const f16 m = select_less(-old, 0.0f, old * rates.beta + g2 * (1 - rates.beta), g2);
             alignas(64) float root[16];
             store(root, m);
-            for (int j = 0; j < 16; ++j) root[j] = std::sqrt(root[j]) + opt.eps;
+            for (int j = 0; j < 16; ++j) root[j] = std::sqrt(root[j]) + rates.eps;
             store(moment, m);
             store(value, load<f16>(value) - rate[k] * g / load<f16>(root));
         }
@@ -152,103 +127,173 @@ template <int B> void apply(const GradientSink& sink, const VertexGradients& sum
     }
 }
 
-inline void add_statistics(const Visit& leaf, const LeafStatistics& out, float pixel_angle) {
-    float& w = out.max_weight[leaf.leaf];
-    w = std::max(w, leaf.max_weight);
-    out.error[leaf.leaf] += leaf.error;
-    float& f = out.footprint[leaf.leaf];
-    f = std::max(f, leaf.side / (std::max(leaf.near, 1e-6f) * pixel_angle));
+inline void add_statistics(const PacketRecord& rec, int bucket, const LeafStatistics& out) {
+    for (int32_t k = rec.first_visit[bucket]; k < rec.first_visit[bucket + 1]; ++k) {
+        const Visit& leaf = rec.visits[size_t(k)];
+        float& w = out.max_weight[leaf.leaf];
+        w = std::max(w, leaf.max_weight);
+        out.error[leaf.leaf] += leaf.error;
+        float& f = out.footprint[leaf.leaf];
+        f = std::max(f, leaf.side / (std::max(leaf.near, 1e-6f) * out.pixel_angle));
+    }
 }
 
-template <int B>
-StepReport backward_rays(const Tree& tree, const Rays& rays, const RenderOptions& options, const Cotangents* cotangents,
-                         const Loss* loss, const GradientSink& sink, const LeafStatistics& statistics, float pixel_angle) {
-    // Packets: runs of at most 64 rays from one origin.
-    std::vector<std::pair<int64_t, int>> packets;
+// A run of at most 64 rays from one origin.
+struct Run { int64_t first; int n; };
+
+inline std::vector<Run> runs_of(const Rays& rays) {
+    std::vector<Run> runs;
     for (int64_t i = 0; i < rays.n;) {
         const int64_t tile_end = std::min<int64_t>((i / kTile + 1) * kTile, rays.n);
         int64_t j = i + 1;
         if (rays.origin_per_tile) j = tile_end;
         else
             while (j < tile_end && !std::memcmp(rays.origins + 3 * j, rays.origins + 3 * i, 12)) ++j;
-        packets.emplace_back(i, int(j - i));
+        runs.push_back({i, int(j - i)});
         i = j;
     }
-    static std::mutex one_call;
-    const std::lock_guard<std::mutex> lock(one_call);
-    static std::deque<Arena> arenas;  // of the threads
-    static std::mutex growing;
-    for (Arena& arena : arenas) arena.clear();
-    const auto arena_of = [](int thread) -> Arena& {
-        const std::lock_guard<std::mutex> lock(growing);
-        while (arenas.size() <= size_t(thread)) arenas.emplace_back();
-        return arenas[size_t(thread)];
-    };
-    static std::vector<PacketRecord> records;
-    records.resize(packets.size());
-    const int n = int(packets.size()), shift = bucket_shift(tree.n_vertices);
+    return runs;
+}
 
-    nerfvol::parallel_for(n, [&](int i, int thread) {
-        PacketRecord& rec = records[size_t(i)];
-        const int64_t first = packets[size_t(i)].first;
-        const int count = packets[size_t(i)].second;
-        Packet<1> p;
-        load_packet(tree, rays, first, first + count, p);
-        if (loss) {
-            uint64_t& alive = p.strips[0].alive;
-            const uint64_t all = alive;
-            for (int l = 0; l < count; ++l)
-                if (!(loss->weight[first + l] > 0)) alive &= ~(1ull << l);
-            if (alive != all) bound_packet(p);  // without the padding the pyramid is tighter
-        }
-        BasisRows<B> basis;
-        basis.fill(p.strips[0], tree.sh_degree);
-        PacketState<1> state;
-        static thread_local Workspace workspace;
-        Workspace& work = workspace;
-        forward_packet<B>(tree, p, basis, options.early_stop_eps, state, work);
-        Adjoint adjoint;
-        rec.report = {0, 0, double(work.size)};
-        if (loss) adjoint_of_loss(*loss, state, first, count, adjoint, rec.report);
-        else adjoint_of_cotangents(tree, *cotangents, options, state, first, count, adjoint);
-        static thread_local VertexTable table;
-        static thread_local VertexGradients of_packet;
-        VertexGradients& gradients = of_packet;
-        backward_packet<B>(tree, basis, work, adjoint, table, gradients);
-        if (!statistics.max_weight) work.visits.clear();
-        group_by_bucket<B>(tree, shift, gradients, work.visits, arena_of(thread), rec);
-    });
+// What is asked of a batch: an adjoint of the cotangents or, where there is one, of the loss. statistics: null arrays, none.
+struct Batch {
+    const Tree& tree;
+    const Rays& rays;
+    const RenderOptions& options;
+    const Cotangents* cotangents;
+    const Loss* loss;
+    const LeafStatistics& statistics;
+};
 
-    nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
-        static thread_local VertexGradients per_thread;
-        VertexGradients& sums = per_thread;
-        sums.start(size_t(1) << shift, 16 * B);
-        for (int i = 0; i < n; ++i) {
-            const PacketRecord& rec = records[size_t(i)];
-            if (i + 2 < n) __builtin_prefetch(records[size_t(i + 2)].vertices + records[size_t(i + 2)].first_row[bucket]);
-            if (i + 1 < n) prefetch_rows<B>(records[size_t(i + 1)], bucket, sink.slots);
-            add_rows<B>(rec, bucket, sink.slots, sums);
-            for (int32_t k = rec.first_visit[bucket]; k < rec.first_visit[bucket + 1]; ++k)
-                add_statistics(rec.visits[size_t(k)], statistics, pixel_angle);
-        }
-        apply<B>(sink, sums);
-    });
+// What a thread uses for one packet or bucket and keeps for the next: one for all degrees.
+struct Scratch {
+    Workspace work;
+    VertexTable table;
+    VertexGradients gradients;
+};
 
+inline Scratch& scratch() {
+    static thread_local Scratch of_thread;
+    return of_thread;
+}
+
+// Loads the rays of a run and marches them; rays of weight 0 are not walked.
+template <int B> void forward_run(const Batch& batch, Run run, BasisRows<B>& basis, PacketState<1>& state, Workspace& work) {
+    Packet<1> p;
+    load_packet(batch.tree, batch.rays, run.first, run.first + run.n, p);
+    if (batch.loss) {
+        uint64_t& alive = p.strips[0].alive;
+        const uint64_t all = alive;
+        for (int l = 0; l < run.n; ++l)
+            if (!(batch.loss->weight[run.first + l] > 0)) alive &= ~(1ull << l);
+        if (alive != all) bound_packet(p);  // without the padding the pyramid is tighter
+    }
+    basis.fill(p.strips[0], batch.tree.sh_degree);
+    forward_packet<B>(batch.tree, p, basis, batch.options.early_stop_eps, state, work);
+}
+
+// Phase 1 of one packet: its record, in the arena.
+template <int B> void backward_run(const Batch& batch, Run run, int shift, Arena& arena, PacketRecord& rec) {
+    Scratch& mine = scratch();
+    BasisRows<B> basis;
+    PacketState<1> state;
+    forward_run<B>(batch, run, basis, state, mine.work);
+    Adjoint adjoint;
+    rec.report = {0, 0, double(mine.work.size)};
+    if (batch.loss) adjoint_of_loss(*batch.loss, state, run.first, run.n, adjoint, rec.report);
+    else adjoint_of_cotangents(batch.tree, *batch.cotangents, batch.options, state, run.first, run.n, adjoint);
+    backward_packet<B>(batch.tree, basis, mine.work, adjoint, mine.table, mine.gradients);
+    group_rows<B>(shift, mine.gradients, arena, rec);
+    if (!batch.statistics.max_weight) mine.work.visits.clear();
+    group_visits(batch.tree, shift, mine.work.visits, arena, rec);
+}
+
+// The same where only the leaves' statistics are asked for: no rows.
+template <int B> void observe_run(const Batch& batch, Run run, int shift, Arena& arena, PacketRecord& rec) {
+    Workspace& work = scratch().work;
+    BasisRows<B> basis;
+    PacketState<1> state;
+    forward_run<B>(batch, run, basis, state, work);
+    Adjoint adjoint;
+    rec.report = {0, 0, double(work.size)};
+    adjoint_of_loss(*batch.loss, state, run.first, run.n, adjoint, rec.report);
+    for (size_t v = 0; v < work.visits.size(); ++v) {
+        const Hit* h = work.hits.get() + work.first_hit[v];
+        for (int i = 0; i < work.visits[v].n_hits; ++i) work.visits[v].error += h[i].weight * adjoint.error[h[i].lane];
+    }
+    group_visits(batch.tree, shift, work.visits, arena, rec);
+}
+
+inline StepReport total_of(const PacketRecord* records, size_t n) {
     StepReport total{0, 0, 0};
-    for (int i = 0; i < n; ++i) {
-        total.squared_error += records[size_t(i)].report.squared_error;
-        total.weight += records[size_t(i)].report.weight;
-        total.samples += records[size_t(i)].report.samples;
+    for (size_t i = 0; i < n; ++i) {
+        total.squared_error += records[i].report.squared_error;
+        total.weight += records[i].report.weight;
+        total.samples += records[i].report.samples;
     }
     return total;
 }
 
-inline StepReport backward(const Tree& tree, const Rays& rays, const RenderOptions& options, const Cotangents* cotangents,
-                           const Loss* loss, const GradientSink& sink, const LeafStatistics& statistics, float pixel_angle) {
+template <int B> StepReport backward_rays(const Batch& batch, const GradientSink& sink) {
+    const std::vector<Run> runs = runs_of(batch.rays);
+    const int n = int(runs.size()), shift = bucket_shift(batch.tree.n_vertices);
+    Arenas arenas;
+    PacketRecord* records = take<PacketRecord>(arenas.of_thread(0), runs.size());
+    nerfvol::parallel_for(n, [&](int i, int thread) {
+        backward_run<B>(batch, runs[size_t(i)], shift, arenas.of_thread(thread), records[i]);
+    });
+    nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
+        VertexGradients& sums = scratch().gradients;
+        sums.start(size_t(1) << shift, 16 * B);
+        for (int i = 0; i < n; ++i) {
+            if (i + 2 < n) __builtin_prefetch(records[i + 2].vertices + records[i + 2].first_row[bucket]);
+            if (i + 1 < n) prefetch_rows<B>(records[i + 1], bucket, sink.slots);
+            add_rows<B>(records[i], bucket, sink.slots, sums);
+            add_statistics(records[i], bucket, batch.statistics);
+        }
+        apply<B>(sink, sums);
+    });
+    return total_of(records, runs.size());
+}
+
+template <int B> StepReport observe_rays(const Batch& batch) {
+    const std::vector<Run> runs = runs_of(batch.rays);
+    const int n = int(runs.size()), shift = bucket_shift(batch.tree.n_vertices);
+    Arenas arenas;
+    PacketRecord* records = take<PacketRecord>(arenas.of_thread(0), runs.size());
+    nerfvol::parallel_for(n, [&](int i, int thread) {
+        observe_run<B>(batch, runs[size_t(i)], shift, arenas.of_thread(thread), records[i]);
+    });
+    nerfvol::parallel_for(kBuckets, [&](int bucket, int) {
+        for (int i = 0; i < n; ++i) add_statistics(records[i], bucket, batch.statistics);
+    });
+    return total_of(records, runs.size());
+}
+
+inline StepReport backward_batch(const Batch& batch, const GradientSink& sink) {
+    switch (batch.tree.blocks) {
+        case 1: return backward_rays<1>(batch, sink);
+        case 2: return backward_rays<2>(batch, sink);
+        default: return backward_rays<4>(batch, sink);
+    }
+}
+
+inline void backward(const Tree& tree, const Rays& rays, const RenderOptions& options, const Cotangents& cotangents,
+                     const GradientSink& sink) {
+    backward_batch({tree, rays, options, &cotangents, nullptr, LeafStatistics{}}, sink);
+}
+
+inline StepReport train_step(const Tree& tree, const Rays& rays, const Loss& loss, const GradientSink& sink,
+                             const LeafStatistics& statistics) {
+    return backward_batch({tree, rays, loss.options, nullptr, &loss, statistics}, sink);
+}
+
+inline StepReport leaf_statistics(const Tree& tree, const Rays& rays, const Loss& loss, const LeafStatistics& statistics) {
+    const Batch batch{tree, rays, loss.options, nullptr, &loss, statistics};
     switch (tree.blocks) {
-        case 1: return backward_rays<1>(tree, rays, options, cotangents, loss, sink, statistics, pixel_angle);
-        case 2: return backward_rays<2>(tree, rays, options, cotangents, loss, sink, statistics, pixel_angle);
-        default: return backward_rays<4>(tree, rays, options, cotangents, loss, sink, statistics, pixel_angle);
+        case 1: return observe_rays<1>(batch);
+        case 2: return observe_rays<2>(batch);
+        default: return observe_rays<4>(batch);
     }
 }
 

@@ -40,8 +40,8 @@ struct View {
 };
 
 struct RenderOptions {
-    float background[3];
-    float early_stop_eps;                        // a ray ends when its transmittance falls below; 0 = exact
+    float background[3] = {};
+    float early_stop_eps = 0;                    // a ray ends when its transmittance falls below; 0 = exact
 };
 
 // Outputs, each (n) or (n, 3), or (height, width[, 3]) for a view; null = not wanted.
@@ -53,25 +53,33 @@ struct RenderOutput {
 struct Cotangents {
     const float *rgb, *trans, *depth;            // (n,3), (n), (n)
 };
+
+// The loss's terms, field by field those of nerfvol.kernels.state.LossOptions; reference.loss has the formula.
+struct LossOptions : RenderOptions {
+    float colour = 0;                            // weight of sum_i w_i |c_i - target|^2 + T |background - target|^2
+    float distortion = 0;                        // weight of the distortion loss of Mip-NeRF 360 (distances in root cubes)
+    float tv_density = 0, tv_sh = 0;             // weights of differences between the corners of leaves (see add_variation)
+};
 struct Loss {
     const float* target;                         // (n, 3)
     const float* weight;                         // (n) weight of each ray; 0 = padding
-    float background[3];
-    float colour;                                // weight of sum_i w_i |c_i - target|^2 + T |background - target|^2
-    float distortion;                            // weight of the distortion loss of Mip-NeRF 360 (distances in root cubes)
-    float smooth_density, smooth_colour;         // weights of differences between the corners of leaves (see smooth_corners)
+    LossOptions options;
 };
 
-// RMSprop, applied only to vertices that this batch touched.
+// RMSprop, applied only to vertices that this batch touched; field by field nerfvol.kernels.state.Rates.
+struct Rates {
+    float density = 0, dc = 0, sh = 0;
+    float beta = 0, eps = 0;
+};
 struct Optimizer {
     float* values;                               // (n_vertices, 16 * blocks)
     float* moments;                              // second moments, same shape; 0 = never touched
-    float rate_density, rate_dc, rate_sh;
-    float beta, eps;
+    Rates rates;
 };
 
 struct LeafStatistics {                          // (n_leaves), updated in place; null = not wanted
     float *max_weight, *error, *footprint;
+    float pixel_angle;                           // between neighbouring rays, radians: the unit of footprint
 };
 
 struct StepReport {
@@ -87,8 +95,9 @@ struct GradientSink {
 struct Kernels {
     void (*render)(const Tree&, const Rays&, const RenderOptions&, const RenderOutput&);
     void (*render_view)(const Tree&, const View&, const RenderOptions&, const RenderOutput&);
-    StepReport (*backward)(const Tree&, const Rays&, const RenderOptions&, const Cotangents*, const Loss*,
-                           const GradientSink&, const LeafStatistics&, float pixel_angle);
+    void (*backward)(const Tree&, const Rays&, const RenderOptions&, const Cotangents&, const GradientSink&);
+    StepReport (*train_step)(const Tree&, const Rays&, const Loss&, const GradientSink&, const LeafStatistics&);
+    StepReport (*leaf_statistics)(const Tree&, const Rays&, const Loss&, const LeafStatistics&);  // a step that moves nothing
 };
 
 const Kernels& kernels();                        // the chosen instruction set

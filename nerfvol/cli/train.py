@@ -1,0 +1,87 @@
+"""``nerfvol train``: a model from a folder of posed images."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerfvol.cli.command import Command, assemble_options, need, set_threads
+from nerfvol.config.assemble import read_yaml
+from nerfvol.config.training import Config
+from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfvol.training.train import Results
+
+
+def arguments(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--data", metavar="DIR", help="posed images: a folder with transforms*.json (Blender, instant-ngp "
+                   "or nerfstudio layout), LLFF poses or a COLMAP model, or the JSON file itself")  # fmt: skip
+    p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
+                   "previews/, checkpoint.safetensors")  # fmt: skip
+    p.add_argument("--config", metavar="FILE", help="YAML file of settings, such as configs/smoke.yaml")
+    p.add_argument("--init", metavar="mlp|direct", help="start from a small MLP field that is trained first and then "
+                   "distilled, or straight from a low-density octree (default: direct)")  # fmt: skip
+    p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "
+                   "a fixed number of steps, the same result every time (default: none)")  # fmt: skip
+    p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B from 0 to 1: what images with alpha "
+                   "are composited on (default: white)")  # fmt: skip
+    p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
+    p.add_argument("--aabb", metavar="X0,Y0,Z0,X1,Y1,Z1", help="the region of detail in the units of the poses: lowest "
+                   "and highest corner (default: worked out from the cameras)")  # fmt: skip
+    p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
+    p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
+    p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")
+    p.add_argument("--checkpoint-every", metavar="TIME", help="the most a crash can cost (default: 30s)")
+    p.add_argument("--storage", metavar="compact|float16|float32", help="how the model's file holds its values "
+                   "(default: compact)")  # fmt: skip
+    p.add_argument("--set", action="append", metavar="KEY=VALUE", help="any setting of the sections, such as "
+                   "octree.sh_degree=2; repeatable (config.yaml in a run folder lists them all)")  # fmt: skip
+
+
+def run(given: dict[str, Any]) -> int:
+    """Train, and print what came of it."""
+    base = None
+    if given.get("resume") and given.get("out"):
+        from nerfvol.training.prepare import resumable_config
+
+        saved = resumable_config(given["out"])
+        base = (read_yaml(saved), str(saved))
+    config = assemble_options(Config, given, base)
+    need("train", data=config.data, out=config.out)
+    if not Path(config.data).exists():
+        raise InputError(f"--data {config.data}: no such folder or file")
+    set_threads(config.threads)
+    from nerfvol.training.train import train
+
+    results = train(config)
+    if results is not None:
+        print_results(results)
+    return 0
+
+
+def print_results(results: Results) -> None:
+    """What the run came to, in a few lines."""
+    metrics = results.metrics
+    if metrics["results"]:
+        print(f"\n{results.compared:21s}PSNR    SSIM   seconds     leaves      MB   s/frame")
+        for name, row in metrics["results"].items():
+            leaves = "" if row["leaves"] is None else f"{row['leaves']:,}"
+            print(f"{name.replace('_', '-'):18s} {row['psnr']:6.2f}  {row['ssim']:.4f} {row['seconds']:9.1f} "
+                  f"{leaves:>10s} {row['MB']:7.1f} {row['seconds_per_frame']:9.4f}")  # fmt: skip
+    background = ",".join(f"{c:g}" for c in metrics["background"])
+    print(f"\n{metrics['n_images']} held-out views on background {background}: PSNR {metrics['psnr']:.2f} dB, "
+          f"SSIM {metrics['ssim']:.4f}; {results.size}, {metrics['MB']:.1f} MB, "
+          f"{metrics['seconds_per_frame']:.3f} s per frame, {metrics['seconds']:.0f} s in all")  # fmt: skip
+    print(f"model: {results.model}")
+
+
+COMMAND = Command(
+    summary="Train a model from a folder of posed images.",
+    example="nerfvol train --data scene --out run --time-budget 60s\nnerfvol train --resume --out run",
+    options=None,
+    arguments=arguments,
+    run=run,
+    place=10,
+)

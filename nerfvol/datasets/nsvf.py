@@ -1,0 +1,109 @@
+"""NSVF: ``intrinsics.txt`` beside ``pose/*.txt`` and ``rgb/*.png``, as NSVF's scenes and its BlendedMVS and Tanks and
+Temples come.
+
+A pose is a camera-to-world 4x4 matrix in OpenCV axes (x right, y down, z forward), named like its image. Names begin with
+0_ for training, 1_ for validation, 2_ for test. Source: docs/data.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.camera import rigid_pose
+from nerfvol.datasets.bounds import BoundsHint
+from nerfvol.datasets.images import SUFFIXES
+from nerfvol.datasets.listing import Frame, Listing, hold_out
+from nerfvol.errors import InputError
+from nerfvol.files.atomic import read_bytes
+from nerfvol.region import check_box
+
+INTRINSICS, BOX = "intrinsics.txt", "bbox.txt"
+_IMAGES, _POSES = "rgb", "pose"
+_PREFIXES: dict[str, str] = {"0_": "train", "1_": "val", "2_": "test"}
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has NSVF's file and two folders."""
+    return (path / INTRINSICS).is_file() and all((path / name).is_dir() for name in (_IMAGES, _POSES))
+
+
+def read(folder: Path, split: str) -> Listing:
+    """The listing of one split, by the first two letters of the images' names; without such every 8th is held out.
+
+    Where only one of validation and test exists it is used for both. ``bbox.txt``, where there is one, is the aabb.
+    """
+    calibration, source = _calibration(folder / INTRINSICS), folder / INTRINSICS
+    hint = BoundsHint(aabb=_box(folder / BOX) if (folder / BOX).is_file() else None)
+    frames: dict[str, list[Frame]] = {}
+    everything = []
+    for image in sorted(p for p in (folder / _IMAGES).iterdir() if p.suffix.lower() in SUFFIXES):
+        frame = Frame(image.name, image, _pose(folder / _POSES / f"{image.stem}.txt"), calibration)
+        everything.append(frame)
+        frames.setdefault(_PREFIXES.get(image.name[:2], ""), []).append(frame)
+    if not everything:
+        raise InputError(f"{folder / _IMAGES}: expected images, but there are none")
+    if "" in frames or "train" not in frames or len(frames) == 1:
+        chosen, training, sentence = hold_out(everything, split)
+        return Listing(chosen, training, source, hint, [sentence])
+    if split in frames:
+        return Listing(frames[split], frames["train"], source, hint)
+    other = {"val": "test", "test": "val"}[split]
+    message = f"no image is named for the {split} views: the {other} views are used instead"
+    return Listing(frames[other], frames["train"], source, hint, [message])
+
+
+def _rows(path: Path) -> list[list[float]]:
+    """The numbers of a text file, line by line; empty lines drop out."""
+    try:
+        rows = [[float(word) for word in line.split()] for line in read_bytes(path).decode("utf-8").splitlines()]
+    except ValueError:  # UnicodeDecodeError is one
+        raise InputError(f"{path}: expected lines of numbers, got other text") from None
+    return [row for row in rows if row]
+
+
+def _matrix(path: Path, rows: list[list[float]]) -> NDArray[np.float64]:
+    """A 4x4, 3x4 or 3x3 matrix from its rows, or a 4x4 one from 16 numbers in one."""
+    if len(rows) == 1 and len(rows[0]) == 16:
+        return np.array(rows[0]).reshape(4, 4)
+    shape = (len(rows), len(rows[0]) if rows else 0)
+    if shape not in ((4, 4), (3, 4), (3, 3)) or any(len(row) != shape[1] for row in rows):
+        raise InputError(
+            f"{path}: expected a 4x4 matrix, got {len(rows)} rows of {sorted({len(r) for r in rows})} numbers"
+        )
+    return np.array(rows)
+
+
+def _calibration(path: Path) -> Calibration:
+    """fx, fy, cx, cy in pixels from a matrix, or from a first line f, cx, cy, 0 as older files have it; no distortion."""
+    rows = _rows(path)
+    if len(rows) > 1 and len(rows[0]) == 4 and len(rows[1]) != 4:
+        fx = fy = rows[0][0]
+        cx, cy = rows[0][1:3]
+    else:
+        matrix = _matrix(path, rows)
+        fx, fy, cx, cy = (float(matrix[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Calibration(fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def _pose(path: Path) -> NDArray[np.float64]:
+    if not path.is_file():
+        raise InputError(f"{path}: expected the pose of an image, but there is no such file")
+    matrix = _matrix(path, _rows(path))
+    try:
+        matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
+        return rigid_pose(matrix)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _box(path: Path) -> NDArray[np.float64]:
+    """The first six numbers of bbox.txt: two corners; a seventh is the side of NSVF's first voxels."""
+    numbers = [number for row in _rows(path) for number in row]
+    try:
+        return check_box(numbers[:6], "the box")
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
