@@ -10,7 +10,7 @@ from nerfvol.datasets import formats
 from nerfvol.datasets.formats import FORMATS, Format, find_format, formats_help
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
-from tests.datasets import scenes
+from tests.fixtures import scenes
 
 WRITERS = {
     "transforms": scenes.write_instant_ngp,

@@ -5,7 +5,7 @@ import pytest
 
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
-from tests.datasets import scenes
+from tests.fixtures import scenes
 
 LENS = scenes.Intrinsics(24, 16, 30.0, 31.5, 11.75, 8.5)
 BOX = [-1.0, -1.25, -0.75, 1.0, 1.5, 0.5]

@@ -19,7 +19,7 @@ from nerfvol.training.memory import (
     require_memory,
     splits_within,
 )
-from tests.fixtures.tiny import make_sphere_octree
+from tests.fixtures.tiny import make_sphere_octree, write_scene
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,11 @@
 #include "arena.h"
 #include "batch.h"
 #include "pool.h"
+#include "splat_bindings.h"
 #include "topology.h"
 #include "tree.h"
+
+void bind_photographs(nanobind::module_& m);  // sweep_bindings.cpp
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -319,6 +322,8 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
     m.def("restrict_cells", &py_restrict_cells, "mask"_a, "first"_a, "corners"_a, "rows"_a, "weight"_a, "density"_a, "sums"_a);
     m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "row"_a, "out"_a, "target"_a);
+    bind_splats(m);
+    bind_photographs(m);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
     m.def("isa", [] { return std::string(isa_name()); });

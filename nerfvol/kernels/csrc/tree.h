@@ -2,6 +2,8 @@
 #pragma once
 #include <cstdint>
 
+#include "splats.h"
+
 namespace nerfvol {
 
 constexpr int kTile = 64;         // rays in a packet: an 8x8 tile of one image
@@ -101,6 +103,7 @@ struct Kernels {
 };
 
 const Kernels& kernels();                        // the chosen instruction set
+const SplatKernels& splat_kernels();
 const char* isa_name();
 bool set_isa(const char* name);                  // "auto" or a name from available_isas(); false if this CPU lacks it
 int available_isas(const char** names);          // fills up to 3 names, best first

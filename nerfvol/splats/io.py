@@ -1,0 +1,113 @@
+"""Files of Gaussians: arrays in one safetensors file with a JSON document, exact, checked before memory is spent on it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from nerfvol import __version__
+from nerfvol.arrayfile import ArrayFile, write_arrays
+from nerfvol.errors import InputError
+from nerfvol.splats.splats import Splats
+
+FORMAT = "nerfvol splats"
+VERSION = 1
+COLOUR_CONVENTION = "half_plus_sh_clamped"
+FOOTPRINT_VARIANCE = 0.3
+"""Pixels squared that are added to a footprint's covariance; stated in the file since opacities are trained with it."""
+LARGEST_VALUE = 1e15
+_ARRAYS = {"means": (3,), "log_scales": (3,), "quats": (4,), "logits": ()}
+
+
+def save_splats(path: str | os.PathLike[str], splats: Splats, metadata: Mapping[str, Any]) -> int:
+    """Write ``splats`` to ``path`` atomically and return the file's size in bytes.
+
+    ``metadata`` is JSON-able and comes back from :func:`load_splats`; by custom it has "provenance", "background" and
+    "orbit" as an octree's.
+
+    Raises:
+        InputError: the path cannot be written, or a value is not finite.
+    """
+    try:
+        splats.validate()
+    except InputError as error:
+        raise InputError(f"cannot write {path}: {error}") from error
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "nerfvol": __version__,
+        "colour": COLOUR_CONVENTION,
+        "mode": splats.mode,
+        "footprint_variance": FOOTPRINT_VARIANCE,
+        "sh_degree": splats.sh_degree,
+        "n": splats.n,
+        "origin": [float(x) for x in splats.origin],
+        "metadata": dict(metadata),
+    }
+    arrays = {name: getattr(splats, name) for name in (*_ARRAYS, "sh")}
+    return write_arrays(path, arrays, document)
+
+
+def load_splats(path: str | os.PathLike[str]) -> tuple[Splats, dict[str, Any]]:
+    """The Gaussians in ``path`` and the metadata they were saved with.
+
+    Raises:
+        InputError: one sentence that names the file and what is wrong with it.
+    """
+    with ArrayFile(path, "splat file") as file:
+        _check_document(file)
+        document = file.document
+        n, degree = document["n"], document["sh_degree"]
+        for name, row in _ARRAYS.items():
+            file.expect(name, "float32", (n, *row))
+        file.expect("sh", "float32", (n, 3, (degree + 1) ** 2))
+        arrays = {name: file.read(name) for name in (*_ARRAYS, "sh")}
+        for name, values in arrays.items():
+            if values.size and not (np.abs(values) <= LARGEST_VALUE).all():  # fails for what is no number as well
+                raise file.fault(f"some values of {name!r} are not finite or beyond {LARGEST_VALUE:g}")
+        try:
+            splats = Splats(**arrays, origin=np.array(document["origin"], np.float64), mode=document["mode"])
+            splats.validate()
+        except InputError as error:
+            raise file.fault(str(error)) from error
+        return splats, document["metadata"]
+
+
+def describe_splats(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The JSON document in the header of ``path``, checked, without the arrays."""
+    with ArrayFile(path, "splat file") as file:
+        _check_document(file)
+        return file.document
+
+
+def _check_document(file: ArrayFile) -> None:
+    document = file.document
+    if document.get("format") != FORMAT:
+        raise file.fault(f"expected the format {FORMAT!r}, it says {document.get('format')!r}")
+    if document.get("version") != VERSION:
+        raise file.fault(f"this nerfvol reads version {VERSION}, it has version {document.get('version')!r}")
+    expected = (
+        ("colour", (COLOUR_CONVENTION,)),
+        ("footprint_variance", (FOOTPRINT_VARIANCE,)),
+        ("mode", ("mip", "plain")),
+    )
+    for key, known in expected:
+        if document.get(key) not in known:
+            raise file.fault(f"its {key} is {document.get(key)!r}, expected {' or '.join(map(str, known))}")
+    degree, n, origin = document.get("sh_degree"), document.get("n"), document.get("origin")
+    if type(degree) is not int or not 0 <= degree <= 3:
+        raise file.fault(f"its sh_degree is {degree!r}, expected 0, 1, 2 or 3")
+    if type(n) is not int or not 0 <= n < 1 << 31:
+        raise file.fault(f"its n is {n!r}, expected a count")
+    if not isinstance(origin, list) or len(origin) != 3 or not all(_is_place(x) for x in origin):
+        raise file.fault(f"its origin is {origin!r}, expected three finite numbers")
+    if not isinstance(document.get("metadata"), dict):
+        raise file.fault("its metadata is not a JSON object")
+
+
+def _is_place(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value) and abs(value) <= LARGEST_VALUE

@@ -1,0 +1,167 @@
+"""Gaussians in the PLY layout of 3D Gaussian splatting (Kerbl et al. 2023), which every splat viewer reads.
+
+Columns: x y z; nx ny nz (unused zeros); f_dc_0..2; f_rest_0..3(K - 1) - 1 channel by channel (all red, then green, then
+blue); opacity (a logit); scale_0..2 (natural logarithms); rot_0..3 (a quaternion, w first, of any length). float32,
+little-endian. Readers differ in what they tolerate, so no other column is written, and any order is read.
+What the layout does not say is the footprint's low-pass: ``comment SplatRenderMode: mip`` says it as Brush, gsplat and
+splat-transform do (``default`` is plain); Postshot's ``comment antialiased 1`` is read as well.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.errors import InputError
+from nerfvol.splats.plyfile import PlyFile, write_ply
+from nerfvol.splats.splats import Splats
+
+Mode = Literal["mip", "plain"]
+MAX_DEGREE = 3
+LARGEST = 1e15
+"""Of positions, as for cameras; coefficients and logarithms are held to much less."""
+LARGEST_COEFFICIENT = 1e6
+LARGEST_LOG_SCALE = 40.0
+LARGEST_LOGIT = 80.0
+_SHORTEST = 1e-12  # of a quaternion that still is a direction
+_WRITTEN = {"mip": "mip", "plain": "default"}
+
+
+def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
+    """Write ``splats`` to the PLY file ``path`` atomically and return its size in bytes.
+
+    Positions are absolute float32. Quaternions are written as they are, so that a file that is read and written again has
+    the same bytes.
+
+    Raises:
+        InputError: the path cannot be written, or a value is not finite.
+    """
+    splats.validate()
+    columns: dict[str, NDArray[np.float32]] = {}
+    means = splats.means.astype(np.float64) + splats.origin if np.any(splats.origin) else splats.means
+    with np.errstate(over="ignore"):
+        means = means.astype(np.float32)
+    if not np.isfinite(means).all():
+        raise InputError(f"cannot write {path}: positions are too large for the format's float32")
+    columns |= {name: means[:, k] for k, name in enumerate("xyz")}
+    columns |= {name: np.zeros(splats.n, np.float32) for name in ("nx", "ny", "nz")}
+    columns |= {f"f_dc_{k}": splats.sh[:, k, 0] for k in range(3)}
+    rest = splats.sh[:, :, 1:].reshape(splats.n, -1)  # channel by channel
+    columns |= {f"f_rest_{k}": rest[:, k] for k in range(rest.shape[1])}
+    columns["opacity"] = splats.logits
+    columns |= {f"scale_{k}": splats.log_scales[:, k] for k in range(3)}
+    columns |= {f"rot_{k}": splats.quats[:, k] for k in range(4)}
+    return write_ply(path, [f"SplatRenderMode: {_WRITTEN[splats.mode]}"], columns)
+
+
+def is_splat_ply(path: str | os.PathLike[str]) -> bool:
+    """Whether the PLY file holds Gaussians (its vertices have scales), not mere points.
+
+    Raises:
+        InputError: it is no PLY file.
+    """
+    with PlyFile(path) as file:
+        return "scale_0" in file.dtypes
+
+
+def load_ply(path: str | os.PathLike[str], mode: Mode = "plain") -> Splats:
+    """The Gaussians of a PLY file; ``mode`` is what they are taken for where the file does not say.
+
+    Binary of either byte order and ascii; columns in any order; others are ignored. The origin is 0.
+
+    Raises:
+        InputError: one sentence that names the file and what is wrong with it.
+    """
+    with PlyFile(path) as file:
+        stated = _mode(file)
+        degree = _check_columns(file)
+        table = file.read()
+
+        def columns(*names: str) -> NDArray[np.float32]:
+            with np.errstate(over="ignore"):  # a double too large becomes infinite, and is refused below
+                return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+
+        names = [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
+        sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, :, None]
+        if names:
+            sh = np.concatenate([sh, columns(*names).reshape(len(sh), 3, -1)], axis=2)
+        splats = Splats(
+            means=columns("x", "y", "z"), log_scales=_log_scales(file, columns("scale_0", "scale_1", "scale_2")),
+            quats=columns(*(f"rot_{k}" for k in range(4))), logits=_logits(file, columns("opacity")[:, 0]), sh=sh,
+            origin=np.zeros(3), mode=stated or mode,
+        )  # fmt: skip
+        _check_values(file, splats)
+        return splats
+
+
+def _mode(file: PlyFile) -> Mode | None:
+    """What the comments say of the footprint."""
+    for comment in file.comments:
+        key, _, value = comment.partition(":")
+        if key.strip().lower() == "splatrendermode":
+            known: dict[str, Mode] = {"mip": "mip", "default": "plain"}
+            if value.strip().lower() not in known:
+                raise file.fault(f"its SplatRenderMode is {value.strip()[:40]!r}, expected mip or default")
+            return known[value.strip().lower()]
+        words = comment.lower().split()
+        if words[:1] == ["antialiased"] and len(words) == 2:
+            if words[1] not in ("0", "1"):
+                raise file.fault(f"its comment 'antialiased' says {words[1][:40]!r}, expected 0 or 1")
+            return "mip" if words[1] == "1" else "plain"
+    return None
+
+
+def _check_columns(file: PlyFile) -> int:
+    """The SH degree; refuses a file without the columns of Gaussians."""
+    wanted = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    wanted += [f"scale_{k}" for k in range(3)] + [f"rot_{k}" for k in range(4)]
+    missing = [name for name in wanted if name not in file.dtypes]
+    if missing:
+        what = "these are points, not Gaussians" if "scale_0" in missing else "it holds no Gaussians of this layout"
+        raise file.fault(f"its vertices have no property {missing[0]!r} ({what})")
+    integers = [name for name in wanted if file.dtypes[name].kind != "f"]
+    if integers:
+        raise file.fault(f"its property {integers[0]!r} should be float or double, it is {file.dtypes[integers[0]].name}")
+    rest = sum(name.startswith("f_rest_") for name in file.dtypes)
+    degree = math.isqrt(rest // 3 + 1) - 1
+    if rest != 3 * ((degree + 1) ** 2 - 1) or degree > MAX_DEGREE:
+        raise file.fault(f"it has {rest} columns f_rest_*, expected 0, 9, 24 or 45 (SH degree 0 to {MAX_DEGREE})")
+    for k in range(rest):
+        if f"f_rest_{k}" not in file.dtypes:
+            raise file.fault(f"its vertices have no property 'f_rest_{k}'")
+    return degree
+
+
+def _log_scales(file: PlyFile, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Trainers write -inf for a scale of nothing (discs of 2D splatting): that is the smallest there is."""
+    if np.isnan(values).any() or (values > LARGEST_LOG_SCALE).any():
+        bad = int((~(values <= LARGEST_LOG_SCALE)).any(axis=1).argmax())
+        raise file.fault(f"a scale of vertex {bad} is not a logarithm of at most {LARGEST_LOG_SCALE:g}")
+    return np.maximum(values, np.float32(-LARGEST_LOG_SCALE)) if (values < -LARGEST_LOG_SCALE).any() else values
+
+
+def _logits(file: PlyFile, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Opacities of exactly 0 and 1 have infinite logits; ±80 is the same in float32."""
+    if np.isnan(values).any():
+        raise file.fault(f"the opacity of vertex {int(np.isnan(values).argmax())} is not a number")
+    limit = np.float32(LARGEST_LOGIT)
+    return np.clip(values, -limit, limit) if (np.abs(values) > limit).any() else values
+
+
+def _check_values(file: PlyFile, splats: Splats) -> None:
+    bounds = (
+        ("position", splats.means, LARGEST),
+        ("rotation", splats.quats, LARGEST_COEFFICIENT),
+        ("colour", splats.sh.reshape(splats.n, -1), LARGEST_COEFFICIENT),
+    )
+    for what, values, bound in bounds:
+        good = (np.abs(values) < bound).all(axis=1)  # fails for what is no number as well
+        if not good.all():
+            raise file.fault(f"the {what} of vertex {int((~good).argmax())} is not finite or beyond {bound:g}")
+    length = np.linalg.norm(splats.quats.astype(np.float64), axis=1)
+    if splats.n and length.min() < _SHORTEST:
+        raise file.fault(f"the rotation of vertex {int(length.argmin())} is a quaternion of length 0")

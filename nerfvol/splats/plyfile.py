@@ -1,0 +1,193 @@
+"""PLY files: one header of text, then rows. Only the element "vertex" is read; nothing is believed before it is checked.
+
+The header ends within 64 kB; the number of vertices is held against the file's size before memory is taken for them.
+Format: G. Turk, "The PLY polygon file format", 1994. Rows are read as they lie where all their properties are numbers;
+lists in the vertices themselves are refused, other elements only if they come before the vertices.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.errors import InputError
+from nerfvol.files import atomic_write, explain_os_error
+
+MAX_HEADER = 1 << 16
+MOST_PROPERTIES = 512
+_FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+_RUN = 1 << 24  # bytes that are read at a time
+
+
+class PlyFile:
+    """An open PLY file whose header is known; rows are read when :meth:`read` asks for them.
+
+    ``count``: vertices; ``dtypes``: numpy dtype by property name, in the file's order; ``comments``: without the word
+    itself; ``format``: binary_little_endian, binary_big_endian or ascii.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        try:
+            if self.path.is_dir():
+                raise InputError(f"{path} is a folder, expected a PLY file")
+            self._file = self.path.open("rb")
+        except FileNotFoundError as error:
+            raise InputError(f"no such PLY file: {path}") from error
+        except OSError as error:
+            raise InputError(f"cannot read {path}: {explain_os_error(error)}") from error
+        try:
+            self._size = os.fstat(self._file.fileno()).st_size
+            self._parse(self._header())
+        except OSError as error:
+            self._file.close()
+            raise InputError(f"cannot read {path}: {explain_os_error(error)}") from error
+        except InputError:
+            self._file.close()
+            raise
+
+    def fault(self, reason: str) -> InputError:
+        """The error that says this file cannot be used because of ``reason``."""
+        return InputError(f"{self.path} is not a usable PLY file: {reason}")
+
+    def __enter__(self) -> PlyFile:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._file.close()
+
+    def _header(self) -> list[list[str]]:
+        """The header's lines, split into words, without the first and the last."""
+        start = self._file.read(MAX_HEADER)
+        if start[:4] not in (b"ply\n", b"ply\r"):
+            raise self.fault("it does not start with the line 'ply'")
+        end = start.find(b"\nend_header")
+        if end < 0:
+            raise self.fault(f"its header has no end within {MAX_HEADER} bytes")
+        stop = start.find(b"\n", end + 1)
+        if stop < 0 or start[end + 11 : stop].strip():
+            raise self.fault("its line 'end_header' does not end")
+        self._rows_at = stop + 1
+        try:
+            text = start[:end].decode("ascii")
+        except UnicodeDecodeError:
+            text = start[:end].decode("latin-1")  # comments may hold anything
+        return [words for line in text.splitlines()[1:] if (words := line.split())]
+
+    def _parse(self, lines: list[list[str]]) -> None:
+        self.comments = [" ".join(words[1:]) for words in lines if words[0] in ("comment", "obj_info")]
+        self.dtypes: dict[str, np.dtype] = {}
+        self.count, self.format, element, before = -1, "", "", False
+        for words in lines:
+            if words[0] in ("comment", "obj_info"):
+                continue
+            if words[0] == "format" and len(words) == 3 and words[1] in _FORMATS:
+                self.format = words[1]
+            elif words[0] == "element" and len(words) == 3:
+                element = words[1]
+                if element == "vertex" and self.count < 0:
+                    self.count = self._number(words[2])
+                elif self.count < 0 and self._number(words[2]):
+                    before = True
+            elif words[0] == "property" and len(words) >= 3:
+                if element == "vertex":
+                    self._property(words)
+            else:
+                raise self.fault(f"its header has a line that is not understood: {' '.join(words)[:60]!r}")
+        if not self.format:
+            raise self.fault("its header states no format that is known (binary or ascii, version 1.0)")
+        if self.count < 0 or not self.dtypes:
+            raise self.fault("its header declares no vertices")
+        if before:
+            raise self.fault("another element comes before its vertices")
+        self._check_size()
+
+    def _number(self, word: str) -> int:
+        if not (word.isascii() and word.isdigit()) or len(word) > 18:
+            raise self.fault(f"a count should be a whole number, it is {word[:40]!r}")
+        return int(word)
+
+    def _property(self, words: Sequence[str]) -> None:
+        if not self.format:
+            raise self.fault("its header lists properties before it states the format")
+        if words[1] == "list":
+            raise self.fault(f"its vertices have a list ({' '.join(words)[:60]!r}), expected numbers only")
+        if len(words) != 3 or words[1] not in _TYPES:
+            raise self.fault(f"a property should be a type and a name, it is {' '.join(words[1:])[:60]!r}")
+        if words[2] in self.dtypes or len(self.dtypes) == MOST_PROPERTIES:
+            raise self.fault(f"its vertices have the property {words[2][:40]!r} twice, or more than {MOST_PROPERTIES}")
+        self.dtypes[words[2]] = np.dtype(_FORMATS[self.format] + _TYPES[words[1]])
+
+    def _check_size(self) -> None:
+        """Refuses a count of vertices that the file cannot hold."""
+        row = sum(t.itemsize for t in self.dtypes.values())
+        if self.format == "ascii":
+            row = 2 * len(self.dtypes)  # a digit and a space or the line's end
+        have = self._size - self._rows_at + (self.format == "ascii")
+        if self.count * row > have:
+            raise self.fault(f"it declares {self.count} vertices, which need {self.count * row} bytes, and holds {have}")
+
+    def read(self) -> dict[str, NDArray]:
+        """The vertices' properties by name, each an array (count,) of native byte order."""
+        try:
+            self._file.seek(self._rows_at)
+            return self._read_text() if self.format == "ascii" else self._read_binary()
+        except OSError as error:
+            raise InputError(f"cannot read {self.path}: {explain_os_error(error)}") from error
+
+    def _read_binary(self) -> dict[str, NDArray]:
+        row = np.dtype(list(self.dtypes.items()))
+        out = {name: np.empty(self.count, dtype.newbyteorder("=")) for name, dtype in self.dtypes.items()}
+        run = max(1, _RUN // row.itemsize)
+        for at in range(0, self.count, run):
+            n = min(run, self.count - at)
+            data = self._file.read(n * row.itemsize)
+            if len(data) != n * row.itemsize:
+                raise self.fault("it became shorter while it was read")
+            rows = np.frombuffer(data, row)
+            for name, column in out.items():
+                column[at : at + n] = rows[name]
+        return out
+
+    def _read_text(self) -> dict[str, NDArray]:
+        """Numbers as text, by columns of float64: enough for every type that PLY has."""
+        values = np.empty((self.count, len(self.dtypes)))
+        for i in range(self.count):
+            words = self._file.readline(_RUN).split()
+            try:
+                values[i] = [float(word) for word in words]
+            except ValueError:
+                line = b" ".join(words)[:60].decode("latin-1")
+                raise self.fault(f"vertex {i} should be {len(self.dtypes)} numbers, it is {line!r}") from None
+        out = {}
+        for k, (name, dtype) in enumerate(self.dtypes.items()):
+            column = values[:, k]
+            if dtype.kind in "iu":
+                limits = np.iinfo(dtype)
+                if not ((column >= limits.min) & (column <= limits.max)).all():
+                    raise self.fault(f"a value of {name!r} is outside its type, {limits.min} to {limits.max}")
+            with np.errstate(over="ignore"):  # a number too large for float32 is infinite, which its reader refuses
+                out[name] = column.astype(dtype)
+        return out
+
+
+def write_ply(path: str | os.PathLike[str], comments: Sequence[str], columns: dict[str, NDArray[np.float32]]) -> int:
+    """Write float32 ``columns`` (n,) as the vertices of a binary little-endian PLY, atomically; returns its bytes."""
+    n = len(next(iter(columns.values())))
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    lines += [f"element vertex {n}", *(f"property float {name}" for name in columns), "end_header", ""]
+    header = "\n".join(lines).encode("ascii")
+    run = max(1, _RUN // (4 * len(columns)))
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        file.write(header)
+        for at in range(0, n, run):
+            file.write(np.stack([c[at : at + run] for c in columns.values()], axis=1).astype("<f4").tobytes())
+    return len(header) + 4 * n * len(columns)

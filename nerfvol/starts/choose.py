@@ -1,0 +1,108 @@
+"""Which start a dataset gets, and why: a row a start, asked in order; a name overrules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.errors import InputError
+from nerfvol.splats.points import PointCloud
+from nerfvol.starts.model_points import model_points, points_file
+from nerfvol.starts.plane_sweep import SweepView, plane_sweep, sweep_factor
+from nerfvol.starts.random import random_points
+from nerfvol.starts.subject import Subject, subject_of
+from nerfvol.training.photographs import Photographs
+
+FEW_POINTS = 4_000
+"""A model with fewer points gets those of a plane sweep beside them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """``cloud``: the points, none where nothing was found; ``subject``: its distance and the depths of the scene;
+    ``name``: the row of :data:`STARTS`; ``sentence``: what was chosen, why, and how many points came of it."""
+
+    cloud: PointCloud
+    subject: Subject
+    name: str
+    sentence: str
+
+
+def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = None, seed: int = 0) -> Start:
+    """The points that splats of this dataset begin from.
+
+    Objects on a transparent background begin from random points in their box; photographs from the points of their COLMAP
+    model, else from a plane sweep; a model of fewer than 4,000 points gets the sweep's as well. Where a sweep finds
+    nothing, what there is of a model or random points stand in. ``name``: "points", "sweep", "points+sweep" or "random".
+
+    Raises:
+        InputError: an unknown name, or what is asked for by name finds nothing.
+    """
+    if name is not None and name not in STARTS:
+        raise InputError(f"the start must be one of {', '.join(STARTS)}, got {name!r}")
+    subject = subject_of(dataset)
+    chosen, why = (name, "as asked") if name else _suited(dataset)
+    cloud, found = STARTS[chosen](dataset, photographs, subject, seed)
+    if not len(cloud) and name:
+        raise InputError(f"the start {name!r} cannot be used: {found}")
+    if not len(cloud):
+        cloud = random_points(dataset.scene, seed=seed)
+        found, chosen = f"{found}; {len(cloud)} random points in the scene's box stand in, expect a poor result", "random"
+    return Start(cloud, subject, chosen, f"start: {found} ({why})")
+
+
+def _suited(dataset: Dataset) -> tuple[str, str]:
+    """The row that suits a dataset and why."""
+    if dataset.scene.background_cube is None:
+        return "random", "an object on a transparent background is seen whole"
+    if points_file(dataset) is None:
+        return "sweep", "photographs with poses alone"
+    n = len(model_points(dataset)[0])
+    if n < FEW_POINTS:
+        return "points+sweep", f"the model has only {n} good points"
+    return "points", "the model has points enough"
+
+
+def sweep_views(photographs: Photographs) -> list[SweepView]:
+    """The photographs at the size at which they are swept, without their padding."""
+    lens = [camera.intrinsics for camera in photographs.cameras]
+    factor = sweep_factor(int(np.median([i.width for i in lens])), int(np.median([i.height for i in lens])))
+    held = factor in photographs.held
+    views = [
+        SweepView(np.ascontiguousarray(v.image[: v.height, : v.width]), v.camera) for v in photographs.level(factor)
+    ]
+    if not held:
+        photographs.drop(factor)
+    return views
+
+
+_Found = tuple[PointCloud, str]
+
+
+def _points(dataset: Dataset, photographs: Photographs, subject: Subject, seed: int) -> _Found:
+    return model_points(dataset)
+
+
+def _sweep(dataset: Dataset, photographs: Photographs, subject: Subject, seed: int) -> _Found:
+    return plane_sweep(sweep_views(photographs), subject.near, subject.far, seed=seed)
+
+
+def _both(dataset: Dataset, photographs: Photographs, subject: Subject, seed: int) -> _Found:
+    (a, first), (b, second) = (found(dataset, photographs, subject, seed) for found in (_points, _sweep))
+    return PointCloud.joined(a, b), f"{first}, and {second}"
+
+
+def _random(dataset: Dataset, photographs: Photographs, subject: Subject, seed: int) -> _Found:
+    cloud = random_points(dataset.scene, seed=seed)
+    return cloud, f"{len(cloud)} random points in the scene's box"
+
+
+STARTS: dict[str, Callable[[Dataset, Photographs, Subject, int], _Found]] = {
+    "points": _points,
+    "sweep": _sweep,
+    "points+sweep": _both,
+    "random": _random,
+}

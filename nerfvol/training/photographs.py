@@ -1,0 +1,258 @@
+"""Training images for splats: undistorted once into pinhole canvases, as pyramids; and pictures back through a lens.
+
+A rasteriser draws pinholes. So each photograph is resampled once onto the pinhole canvas that holds all its pixels
+(bicubic; what it does not show has weight 0), and splats are right in every viewer. What is drawn goes the other way to be
+compared with the photograph itself: :func:`through_lens`.
+
+Images are uint8 (height, width, 4), sides padded to multiples of 16; the fourth channel is the weight of the pixel in the
+loss: 255 where the photograph shows it, 0 in padding and outside, between for masks and cut pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras import Camera, Intrinsics
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import UInt8, composite_average, map_threads
+from nerfvol.settings import WHITE
+from nerfvol.training.canvas import MAX_ANGLE, Canvas, canvas_of, is_pinhole, source_grid
+from nerfvol.training.warp import padded, reduce, remap, sample
+
+Float = NDArray[np.float32]
+FACTORS = (8, 4, 2, 1)
+"""The pyramid's levels: 1 / 8 of the photographs' size first."""
+MAX_FACTOR = 64
+_MARGIN = 3  # pixels around what is looked at: the bicubic's taps
+# Rotations (columns: the face's x, y, z axes in the camera's, OpenGL) of the faces ahead, right, left, up, down, behind.
+_CUBE = np.array([
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    [[0, 0, -1], [0, 1, 0], [1, 0, 0]],
+    [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
+    [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],
+], np.float64)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """One photograph at one level. ``image`` (h, w, 4) uint8 with h, w multiples of 16; ``camera`` a pinhole of that size;
+    ``width``, ``height``: the part that is no padding."""
+
+    image: UInt8
+    camera: Camera
+    width: int
+    height: int
+
+
+class Photographs:
+    """The photographs of a dataset as pinhole pictures of any level.
+
+    Full-size canvases of distorted photographs are made at once; levels when they are asked for, and kept until
+    :meth:`drop`. Photographs without distortion cost nothing until then, and their full size is the dataset's own memory.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        background: Sequence[float] = WHITE,
+        alpha: Literal["background", "mask"] = "background",
+        max_angle: float = MAX_ANGLE,
+        threads: int | None = None,
+    ) -> None:
+        """``alpha``: images with transparency are composited over ``background`` (objects), or it is the loss's weight
+        (masked photographs). ``max_angle``: radians to each side of the axis, the widest a canvas is.
+
+        Raises:
+            InputError: the lens of a view cannot be undone.
+        """
+        self.names, self.messages = list(dataset.names), []
+        self._threads = dataset.threads if threads is None else threads
+        self._levels: dict[int, dict[int, TrainingView]] = {}
+        canvases = {lens: canvas_of(lens, max_angle) for lens in {c.intrinsics for c in dataset.cameras}}
+        self.cameras = [Camera(canvases[c.intrinsics].camera, c.c2w) for c in dataset.cameras]
+        grids = {lens: source_grid(canvas, lens) for lens, canvas in canvases.items() if not is_pinhole(lens)}
+        over = background if alpha == "background" else None
+
+        def make(i: int) -> UInt8:
+            lens, image = dataset.cameras[i].intrinsics, dataset.images[i]
+            if over is not None and image.shape[2] == 4:
+                image = composite_average(image, over, 1)
+            return undistorted(image, canvases[lens], *grids[lens]) if lens in grids else image
+
+        self._sources = map_threads(make, range(len(dataset)), self._threads)
+        wide = [c.intrinsics for c in dataset.cameras if canvases[c.intrinsics].cropped]
+        if wide:
+            self.messages.append(
+                f"{len(wide)} of {len(dataset)} photographs show more than {math.degrees(max_angle):.0f} degrees to a side "
+                "of their axis: training leaves out what is beyond"
+            )
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all images held now."""
+        held = {id(image): image.nbytes for image in self._sources}
+        held |= {id(view.image): view.image.nbytes for level in self._levels.values() for view in level.values()}
+        return sum(held.values())
+
+    @property
+    def held(self) -> set[int]:
+        """The factors of which images are held now."""
+        return set(self._levels)
+
+    def view(self, i: int, factor: int) -> TrainingView:
+        """View i at 1 / factor of its size, made where it is not yet; a power of two up to 64."""
+        check_factor(factor)
+        level = self._levels.setdefault(factor, {})
+        if i not in level:
+            level[i] = self._make(i, factor)
+        return level[i]
+
+    def level(self, factor: int) -> list[TrainingView]:
+        """All views at 1 / factor of their size."""
+        return map_threads(lambda i: self.view(i, factor), range(len(self)), self._threads)
+
+    def drop(self, factor: int) -> None:
+        """Release a level's images; full-size canvases stay, since the others are made from them."""
+        self._levels.pop(factor, None)
+
+    def _make(self, i: int, factor: int) -> TrainingView:
+        camera, source = self.cameras[i], self._sources[i]
+        lens = level_camera(camera.intrinsics, factor)
+        width, height = (-(-n // factor) for n in (camera.intrinsics.width, camera.intrinsics.height))
+        size = (lens.height, lens.width)
+        if factor == 1 and source.shape != (*size, 4):
+            # The padded copy takes the place of what it was made from.
+            source = self._sources[i] = reduce(source, 1, size)
+        image = source if factor == 1 else reduce(source, factor, size)
+        return TrainingView(image, replace(camera, intrinsics=lens), width, height)
+
+
+def check_factor(factor: int) -> None:
+    """ValueError unless the factor is a power of two up to 64."""
+    if factor not in (1, 2, 4, 8, 16, 32, MAX_FACTOR):
+        raise ValueError(f"a level's factor must be a power of two up to {MAX_FACTOR}, got {factor!r}")
+
+
+def level_camera(canvas: Intrinsics, factor: int) -> Intrinsics:
+    """The pinhole of a canvas averaged over factor x factor pixels, with its sides padded to multiples of 16."""
+    width, height = (padded(-(-n // factor)) for n in (canvas.width, canvas.height))
+    return replace(
+        canvas, width=width, height=height, fx=canvas.fx / factor, fy=canvas.fy / factor,
+        cx=canvas.cx / factor, cy=canvas.cy / factor,
+    )  # fmt: skip
+
+
+def undistorted(image: UInt8, canvas: Canvas, grid: Float, step: int) -> UInt8:
+    """The photograph (h, w, 3 or 4) on its canvas, padded: (height, width, 4), the fourth 0 where it shows nothing."""
+    camera = canvas.camera
+    used = (camera.height, camera.width)
+    return remap(image, grid, step, used, (padded(used[0]), padded(used[1])))
+
+
+def estimate_bytes(
+    cameras: Sequence[Camera], factors: Sequence[int] = FACTORS, max_angle: float = MAX_ANGLE
+) -> int:
+    """Bytes that :class:`Photographs` of these cameras holds once all views of the levels ``factors`` are made."""
+    total = 0
+    for camera in cameras:
+        canvas = canvas_of(camera.intrinsics, max_angle).camera
+        for factor in {*factors, 1}:
+            lens = level_camera(canvas, factor)
+            total += 4 * lens.width * lens.height
+    return total
+
+
+# ------------------------------------------------------------------ back through the lens
+Pictures = Mapping[str, NDArray]
+DISTANCES = ("depth", "median_depth")
+SAME_SURFACE = 0.05
+"""Distances that differ by a larger share belong to two surfaces."""
+
+
+def through_lens(render_pinhole: Callable[[Camera], Pictures], camera: Camera) -> dict[str, Float]:
+    """What ``camera`` shows through its lens, from pictures of pinholes.
+
+    Args:
+        render_pinhole: draws a pinhole camera: arrays (height, width) or (height, width, k) by name.
+        camera: any lens. Without distortion it is drawn as it is. Lenses up to 60 degrees to each side of the axis are
+            drawn as one canvas, wider ones as the faces of a cube that they see.
+
+    Returns:
+        The same names, float32, of the camera's size. All are resampled bicubically but "depth" and "median_depth"
+        (distances along the ray): a hole (0, infinite, no number) where the nearest pixel is one, else the mean of those of
+        the four pixels around that are within 5 % of the nearest one's, by bilinear weights: no distance lies between two
+        surfaces. "normal" is made a unit vector again.
+    """
+    lens = camera.intrinsics
+    if is_pinhole(lens):
+        return {name: np.asarray(a, np.float32) for name, a in render_pinhole(camera).items()}
+    directions = lens.directions().reshape(-1, 3)
+    out: dict[str, Float] = {}
+    for rotation, chosen in _faces(directions):
+        local = directions[chosen] @ rotation.astype(np.float32)
+        plane = local[:, :2] / -local[:, 2:] * (lens.fx, -lens.fy)
+        first = np.floor(plane.min(axis=0)) - _MARGIN
+        width, height = (int(n) for n in np.ceil(plane.max(axis=0)) + _MARGIN - first)
+        pinhole = Intrinsics(width, height, lens.fx, lens.fy, -float(first[0]), -float(first[1]))
+        pose = camera.c2w.copy()
+        pose[:3, :3] = pose[:3, :3] @ rotation
+        places = (plane - first).astype(np.float32)
+        for name, drawn in render_pinhole(Camera(pinhole, pose)).items():
+            picture = np.asarray(drawn, np.float32)
+            whole = out.setdefault(name, np.zeros((len(directions), *picture.shape[2:]), np.float32))
+            whole[chosen] = _resampled(name, picture.reshape(height, width, -1), places).reshape(whole[chosen].shape)
+    return {name: a.reshape(lens.height, lens.width, *a.shape[1:]) for name, a in out.items()}
+
+
+def _faces(directions: Float) -> list[tuple[NDArray[np.float64], NDArray[np.bool_] | slice]]:
+    """Pinholes that together see unit directions (n, 3): rotation to the camera's axes, and which directions each draws."""
+    limit = math.tan(MAX_ANGLE) * -directions[:, 2]
+    if (np.abs(directions[:, :2]).max(axis=1) <= limit).all():
+        return [(np.eye(3), slice(None))]
+    face = np.argmax(directions @ -_CUBE[:, :, 2].astype(np.float32).T, axis=1)
+    return [(_CUBE[k], face == k) for k in range(len(_CUBE)) if (face == k).any()]
+
+
+def _resampled(name: str, picture: Float, places: Float) -> Float:
+    """A drawn picture (h, w, k) at places (n, 2), as its kind wants it: (n, k)."""
+    if name in DISTANCES:
+        return _distances(picture, places)
+    values = sample(picture, places, cubic=True)
+    if name == "normal":
+        values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
+    return values
+
+
+def _distances(picture: Float, places: Float) -> Float:
+    """Distances (h, w, 1) at places (n, 2): a hole where the nearest pixel is one, else the mean of those of its surface."""
+    height, width = picture.shape[:2]
+    distance = picture[..., 0]
+    corner = np.floor(places - 0.5).astype(np.int64)
+    part = places - 0.5 - corner
+
+    def at(column: NDArray[np.int64], row: NDArray[np.int64]) -> Float:
+        return distance[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+
+    nearest = at(*np.floor(places).astype(np.int64).T)
+    total, weight = np.zeros(len(places)), np.zeros(len(places))
+    for dy in (0, 1):
+        for dx in (0, 1):
+            value = at(corner[:, 0] + dx, corner[:, 1] + dy)
+            share = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
+            with np.errstate(invalid="ignore"):  # of infinities; they belong to no surface
+                share = np.where(np.abs(value - nearest) <= SAME_SURFACE * nearest, share, 0.0)
+            total += np.where(share > 0, value, 0.0) * share
+            weight += share
+    hole = ~((nearest > 0) & np.isfinite(nearest)) | (weight <= 0)
+    return np.where(hole, nearest, total / np.where(hole, 1.0, weight)).astype(np.float32)[:, None]
