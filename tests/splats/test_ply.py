@@ -276,7 +276,9 @@ def test_points_become_gaussians_as_wide_as_they_are_apart():
     normal = np.array([0.3, -0.5, -0.8])
     normal /= np.linalg.norm(normal)
     places = grid()
-    cloud = PointCloud(places, np.full((49, 3), [0.2, 0.5, 0.9], np.float32), np.tile(normal, (49, 1)).astype(np.float32))
+    cloud = PointCloud(
+        places, np.full((49, 3), [0.2, 0.5, 0.9], np.float32), np.tile(normal, (49, 1)).astype(np.float32)
+    )
     middle = 24  # its 8 neighbours: four at 1 step, four at sqrt(2)
     splats = splats_of_points(cloud, scale=1.0)
     splats.validate()

@@ -73,7 +73,9 @@ def test_the_canvas_holds_every_pixel_of_the_photograph(name):
     where = canvas.camera.project(directions)
     assert (where > -0.02).all() and (where < (canvas.camera.width + 0.02, canvas.camera.height + 0.02)).all()
     # and no more than it needs: less than a pixel is free on each side
-    assert (where.min(axis=0) < 1).all() and (where.max(axis=0) > (canvas.camera.width - 1, canvas.camera.height - 1)).all()
+    assert (where.min(axis=0) < 1).all() and (
+        where.max(axis=0) > (canvas.camera.width - 1, canvas.camera.height - 1)
+    ).all()
 
 
 @pytest.mark.parametrize("name", LENSES)
