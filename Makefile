@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test sanitize clang no-compiler clean
+.PHONY: demo test lint sanitize clang no-compiler clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -15,6 +15,13 @@ demo: $(BIN)/python
 test: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python -m pytest -q
+
+# Style, format and types, as pyproject.toml says.
+lint: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test,dev]'
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 # The kernels' tests on a build with address and undefined-behaviour sanitizers.
 sanitize: $(BIN)/python

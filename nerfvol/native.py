@@ -30,7 +30,7 @@ def native() -> ModuleType | None:
     if os.environ.get("NERFVOL_REFERENCE"):
         return None
     try:
-        import _nerfvol_kernels
+        import _nerfvol_kernels  # pyright: ignore[reportMissingImports]  # the extension, where it was built
     except ImportError as e:
         warnings.warn(
             f"nerfvol's compiled kernels are not available ({e}): running on the torch reference, which is far slower; "

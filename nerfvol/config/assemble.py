@@ -99,7 +99,7 @@ def _update(settings: Any, mapping: Mapping[str, Any], source: str, prefix: str)
         if name not in known:
             raise InputError(f"{source}: unknown key {prefix + str(key)!r}{_nearest(name, known, prefix)}")
         current = getattr(settings, name)
-        if dataclasses.is_dataclass(current):
+        if dataclasses.is_dataclass(current) and not isinstance(current, type):
             if not isinstance(value, Mapping):
                 raise InputError(f"{source}: {prefix}{name} is a section, expected keys and values, got {value!r}")
             current = dataclasses.replace(current)

@@ -103,13 +103,13 @@ class _TruncatedExp(torch.autograd.Function):
     """exp(x) whose gradient uses min(x, 15): a large value cannot overflow the step it causes."""
 
     @staticmethod
-    def forward(ctx, x: Tensor) -> Tensor:
+    def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
         return torch.exp(x.clamp(max=80))
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:
-        return grad * torch.exp(ctx.saved_tensors[0].clamp(max=15))
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        return grads[0] * torch.exp(ctx.saved_tensors[0].clamp(max=15))
 
 
 def truncated_exp(x: Tensor) -> Tensor:

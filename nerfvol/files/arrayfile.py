@@ -54,7 +54,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray],
         file.write(len(text).to_bytes(8, "little"))
         file.write(text)
         for name in names:
-            file.write(memoryview(ordered[name].reshape(-1).view(np.uint8)))
+            file.write(ordered[name].reshape(-1).view(np.uint8).data)
     return 8 + len(text) + offset
 
 

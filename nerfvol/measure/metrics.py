@@ -92,7 +92,8 @@ def _window_means(maps: Floats) -> Floats:
 def _pair(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> tuple[Floats, Floats]:
     """Both as float32 or float64 arrays of one shape; 8-bit images are not taken for values in [0, 1]."""
     # A tensor that requires a gradient does not turn into an array by itself.
-    a, b = (np.asarray(x.detach().cpu() if hasattr(x, "detach") else x) for x in (image, reference))
+    detach = (getattr(x, "detach", None) for x in (image, reference))
+    a, b = (np.asarray(x if of is None else of().cpu()) for x, of in zip((image, reference), detach, strict=True))
     if a.shape != b.shape or a.size == 0:
         raise InputError(f"images to compare must have one shape and some pixels, got {a.shape} and {b.shape}")
     if not (np.issubdtype(a.dtype, np.floating) and np.issubdtype(b.dtype, np.floating)):

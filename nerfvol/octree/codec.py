@@ -45,7 +45,7 @@ def encode(density: Float, sh: Float, quality: float = 1.0) -> tuple[dict[str, B
     density (n,), sh (n, 3, K), both finite. ``quality`` divides every step: 2 halves the error for about 15 % more
     bytes. Values beyond the codes' range (raw density about 1e200, colour beyond 250) are clipped.
     """
-    parameters = {
+    parameters: dict[str, Any] = {
         "density_step": DENSITY_STEP / quality,
         "density_softness": DENSITY_SOFTNESS,
         "sh_step": COLOUR_STEP / _Y00 / quality,
@@ -119,7 +119,7 @@ def plane_names(basis_dim: int) -> list[str]:
     return [plane_name(index, plane) for index in range(1 + 3 * basis_dim) for plane in _PLANES]
 
 
-def _round(values: Float) -> NDArray[np.int32]:
+def _round(values: NDArray[np.floating]) -> NDArray[np.int32]:
     return np.clip(np.rint(values), -_LIMIT, _LIMIT).astype(np.int32)
 
 
@@ -146,14 +146,14 @@ def _unpack(index: int, planes: list[Bytes], count: int, differences: bool) -> N
 def _deflate(plane: Bytes) -> bytes:
     # There are no repeated strings to find in noise: runs and Huffman codes alone are as small and far quicker.
     packer = zlib.compressobj(level=6, method=zlib.DEFLATED, wbits=15, memLevel=9, strategy=zlib.Z_RLE)
-    return packer.compress(memoryview(plane)) + packer.flush()
+    return packer.compress(plane.data) + packer.flush()
 
 
 def _inflate(index: int, data: Bytes, count: int) -> Bytes:
     """Exactly ``count`` bytes: a stream that would give more stops there, whatever it claims."""
     unpacker = zlib.decompressobj()
     try:
-        plane = unpacker.decompress(memoryview(np.ascontiguousarray(data)), count + 1)
+        plane = unpacker.decompress(np.ascontiguousarray(data).data, count + 1)
     except zlib.error as error:
         raise ValueError(f"channel {index} is damaged ({error})") from error
     if len(plane) != count or not unpacker.eof:

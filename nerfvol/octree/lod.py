@@ -20,6 +20,7 @@ Source: restriction as the transpose of interpolation, Briggs, Henson & McCormic
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerfvol.errors import InputError
 from nerfvol.native import aligned_empty, native
@@ -60,7 +61,7 @@ def _average(octree: Octree) -> Averages:
     sigma = (octree.density_scale * explin(octree.density)).astype(np.float32)
     rows_of_level, corners_of_level = [], []
     nothing = np.empty((0, 8), np.int32), np.empty((0, octree.values.shape[1]), np.float32), np.empty(0, np.float32)
-    below = nothing  # corners, rows and sigma of the nodes one level down
+    below: tuple[np.ndarray, np.ndarray, np.ndarray] = nothing  # corners, rows and sigma of the nodes one level down
     for level in range(len(starts) - 2, -1, -1):
         start, end = starts[level], starts[level + 1]
         side = octree.size / 2.0**level
@@ -122,7 +123,9 @@ def _shared(sums: np.ndarray, corners: np.ndarray, n_vertices: int) -> tuple[np.
 _WEIGHTS = LATTICE_WEIGHTS[LATTICE_OF_CORNER].transpose(0, 2, 1).astype(np.float32) / 8
 
 
-def _restrict(mask, first, corners, rows, weight, sums) -> None:
+def _restrict(
+    mask: np.ndarray, first: np.ndarray, corners: np.ndarray, rows: np.ndarray, weight: np.ndarray, sums: np.ndarray
+) -> None:
     """Adds to ``sums`` (n, 8, row) what the children named by ``mask`` (n,) hold; see csrc/topology.h."""
     if (compiled := native()) is not None:
         compiled.restrict_cells(mask, first, corners, rows, weight, DENSITY_SLOT, sums)
@@ -136,7 +139,7 @@ def _restrict(mask, first, corners, rows, weight, sums) -> None:
 
 
 # ------------------------------------------------------------------ octrees in which nodes stand in
-def standing_in(octree: Octree, origin, coarse: float) -> np.ndarray:
+def standing_in(octree: Octree, origin: ArrayLike, coarse: float) -> np.ndarray:
     """The nodes that a view from ``origin`` (3,), scene units, does not open: (n_nodes,) bool.
 
     Those whose side is below ``coarse`` (radians) times the distance of their centre. The root is always opened.
@@ -149,27 +152,27 @@ def standing_in(octree: Octree, origin, coarse: float) -> np.ndarray:
     return small
 
 
-def may_stand_in(octree: Octree, origins, coarse: float) -> bool:
+def may_stand_in(octree: Octree, origins: ArrayLike, coarse: float) -> bool:
     """False where :func:`standing_in` surely holds for no node, seen from any of ``origins`` (n, 3)."""
     finest = octree.max_level - 1
     farthest = np.linalg.norm(np.asarray(origins) - (octree.origin + octree.size / 2), axis=-1).max(initial=0)
     return finest > 0 and octree.size / 2.0**finest < coarse * (farthest + octree.size * 3**0.5 / 2)
 
 
-def cut(octree: Octree, nodes) -> Octree:
+def cut(octree: Octree, nodes: ArrayLike) -> Octree:
     """The octree in which each of ``nodes`` (n_nodes,) bool, the root excepted, is a leaf and stands in for what is below.
 
     A leaf and a node that touch share no vertex, since they hold different values there.
     """
-    nodes = np.asarray(nodes, bool)
+    closes = np.asarray(nodes, bool)
     averages = node_averages(octree)
     starts = level_starts(octree.node_mask)
     parent = np.repeat(np.arange(octree.n_nodes), POPCOUNT[octree.node_mask])  # of nodes 1, 2, ...
     opened = np.ones(octree.n_nodes, bool)
     for start, end in zip(starts[1:-1], starts[2:], strict=True):
-        opened[start:end] = opened[parent[start - 1 : end - 1]] & ~nodes[start:end]
+        opened[start:end] = opened[parent[start - 1 : end - 1]] & ~closes[start:end]
     whole = np.flatnonzero(opened[np.repeat(np.arange(octree.n_nodes), POPCOUNT[octree.leaf_mask])])
-    closed = 1 + np.flatnonzero(opened[parent] & nodes[1:])
+    closed = 1 + np.flatnonzero(opened[parent] & closes[1:])
     level = np.searchsorted(starts, closed, side="right") - 1
     level = np.concatenate([octree.leaf_level[whole], level])
     ijk = np.concatenate([octree.leaf_ijk[whole], place_nodes(octree.node_mask, starts)[closed]])

@@ -19,10 +19,10 @@ Laine & Karras, *Efficient Sparse Voxel Octrees* (2010).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerfvol.errors import InputError
 from nerfvol.native import aligned, aligned_empty
@@ -58,7 +58,10 @@ class Octree:
 
     averages: Averages | None = None
 
-    def __init__(self, node_mask, leaf_mask, *, origin, size: float, sh_degree: int, density_scale: float):
+    def __init__(
+        self, node_mask: ArrayLike, leaf_mask: ArrayLike, *, origin: ArrayLike, size: float, sh_degree: int,
+        density_scale: float,
+    ) -> None:  # fmt: skip
         """An octree with these masks (n_nodes,), whole numbers in 0..255; values as in :meth:`from_leaves`.
 
         Raises InputError where masks or frame (origin, size, degree, scale) describe no octree.
@@ -78,24 +81,25 @@ class Octree:
 
     @classmethod
     def from_leaves(
-        cls, level, ijk, origin: Sequence[float], size: float, sh_degree: int = 1, density_scale: float = 1.0
-    ) -> Octree:
+        cls, level: ArrayLike, ijk: ArrayLike, origin: ArrayLike, size: float, sh_degree: int = 1,
+        density_scale: float = 1.0,
+    ) -> Octree:  # fmt: skip
         """An octree with the given leaves, in any order; values are zero and raw density is -7 (nearly empty).
 
         level: (n,) whole numbers 1..16; ijk: (n, 3) whole numbers in [0, 2**level). Raises InputError where they are
         not, and where leaves overlap.
         """
-        level = _as_whole("leaf levels", level).reshape(-1)
-        ijk = _as_whole("leaf positions", ijk).reshape(-1, 3)
-        if len(level) != len(ijk):
-            raise InputError(f"level has {len(level)} leaves but ijk has {len(ijk)}")
-        if len(level) == 0:
+        levels = _as_whole("leaf levels", level).reshape(-1)
+        cells = _as_whole("leaf positions", ijk).reshape(-1, 3)
+        if len(levels) != len(cells):
+            raise InputError(f"level has {len(levels)} leaves but ijk has {len(cells)}")
+        if len(levels) == 0:
             raise InputError("an octree needs at least one leaf, got none")
-        if level.min() < 1 or level.max() > MAX_LEVEL:
-            raise InputError(f"leaf levels must lie in 1..{MAX_LEVEL}, got {level.min()}..{level.max()}")
-        if (ijk < 0).any() or (ijk >= (1 << level)[:, None]).any():
+        if levels.min() < 1 or levels.max() > MAX_LEVEL:
+            raise InputError(f"leaf levels must lie in 1..{MAX_LEVEL}, got {levels.min()}..{levels.max()}")
+        if (cells < 0).any() or (cells >= (1 << levels)[:, None]).any():
             raise InputError("leaf positions must lie in [0, 2**level), some do not")
-        node_mask, leaf_mask = build_masks(level, ijk)
+        node_mask, leaf_mask = build_masks(levels, cells)
         return cls(node_mask, leaf_mask, origin=origin, size=size, sh_degree=sh_degree, density_scale=density_scale)
 
     # ------------------------------------------------------------------ sizes and places
@@ -139,7 +143,7 @@ class Octree:
         return self._values
 
     @values.setter
-    def values(self, rows) -> None:
+    def values(self, rows: ArrayLike) -> None:
         self._values = aligned(np.asarray(rows), np.float32)
         self.averages = None
 
@@ -149,7 +153,7 @@ class Octree:
         return self.values[:, DENSITY_SLOT]
 
     @density.setter
-    def density(self, raw) -> None:
+    def density(self, raw: ArrayLike) -> None:
         self.values[:, DENSITY_SLOT] = raw
         self.averages = None
 
@@ -159,7 +163,7 @@ class Octree:
         return self.values[:, sh_slots(self.sh_degree)]
 
     @sh.setter
-    def sh(self, coefficients) -> None:
+    def sh(self, coefficients: ArrayLike) -> None:
         self.values[:, sh_slots(self.sh_degree)] = coefficients
         self.averages = None
 
@@ -173,7 +177,7 @@ class Octree:
         return other
 
     # ------------------------------------------------------------------ queries
-    def query(self, points) -> np.ndarray:
+    def query(self, points: ArrayLike) -> np.ndarray:
         """Index of the leaf that contains each point, -1 in empty space or outside: points (n, 3) -> (n,) int64.
 
         A leaf holds its lower faces and not its upper ones.
@@ -198,31 +202,31 @@ class Octree:
         return result
 
     # ------------------------------------------------------------------ changes of topology
-    def prune(self, keep) -> tuple[Octree, Transfer]:
+    def prune(self, keep: ArrayLike) -> tuple[Octree, Transfer]:
         """Keeps the leaves where ``keep`` (n_leaves,) is true; the field inside them does not change."""
-        keep = np.asarray(keep, dtype=bool).reshape(-1)
-        if len(keep) != self.n_leaves:
-            raise InputError(f"keep must have one entry per leaf ({self.n_leaves}), got {len(keep)}")
-        kept = np.flatnonzero(keep).astype(np.int32)
+        stays = np.asarray(keep, dtype=bool).reshape(-1)
+        if len(stays) != self.n_leaves:
+            raise InputError(f"keep must have one entry per leaf ({self.n_leaves}), got {len(stays)}")
+        kept = np.flatnonzero(stays).astype(np.int32)
         if not len(kept):
             raise InputError("this would leave an octree without leaves")
-        new = self._in_same_frame(*pruned_masks(self.node_mask, self.leaf_mask, keep))
+        new = self._in_same_frame(*pruned_masks(self.node_mask, self.leaf_mask, stays))
         new.leaf_level, new.leaf_ijk = self.leaf_level[kept], self.leaf_ijk[kept]
         new.corners, new._n_vertices = renumber_corners(self.corners, kept, self.n_vertices)
         return new, self._carry_values(new, kept, np.full(len(kept), -1, np.int8))
 
-    def subdivide(self, mask) -> tuple[Octree, Transfer]:
+    def subdivide(self, mask: ArrayLike) -> tuple[Octree, Transfer]:
         """Splits the leaves where ``mask`` (n_leaves,) is true into eight.
 
         New vertices take the trilinear value of the leaf they came from, so the field is the same, save where a new
         vertex coincides with one that a finer neighbour already owned: that vertex keeps its value.
         """
-        mask = np.asarray(mask, dtype=bool).reshape(-1)
-        if len(mask) != self.n_leaves:
-            raise InputError(f"mask must have one entry per leaf ({self.n_leaves}), got {len(mask)}")
-        if mask.any() and self.leaf_level[mask].max() >= MAX_LEVEL:
+        splits = np.asarray(mask, dtype=bool).reshape(-1)
+        if len(splits) != self.n_leaves:
+            raise InputError(f"mask must have one entry per leaf ({self.n_leaves}), got {len(splits)}")
+        if splits.any() and self.leaf_level[splits].max() >= MAX_LEVEL:
             raise InputError(f"cannot subdivide below level {MAX_LEVEL}")
-        level, ijk, parent, octant = self._split_leaves(mask)
+        level, ijk, parent, octant = self._split_leaves(splits)
         new = self._in_same_frame(*build_masks(level, ijk))
         new.leaf_level, new.leaf_ijk = level, ijk
         new.corners, new._n_vertices = number_corners(level, ijk)
@@ -288,7 +292,7 @@ def _check_frame(t: Octree) -> None:
         raise InputError(f"density_scale must be positive and finite, got {t.density_scale}")
 
 
-def _as_mask(name: str, mask) -> np.ndarray:
+def _as_mask(name: str, mask: ArrayLike) -> np.ndarray:
     """The mask as contiguous uint8, where that changes no number in it."""
     given = np.asarray(mask)
     with np.errstate(invalid="ignore"):  # NaN has no integer
@@ -298,7 +302,7 @@ def _as_mask(name: str, mask) -> np.ndarray:
     return narrow
 
 
-def _as_whole(what: str, numbers) -> np.ndarray:
+def _as_whole(what: str, numbers: ArrayLike) -> np.ndarray:
     """The numbers as int64, where that changes none of them."""
     given = np.asarray(numbers)
     with np.errstate(invalid="ignore"):

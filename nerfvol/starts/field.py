@@ -270,7 +270,7 @@ def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int =
     sh = np.empty((octree.n_vertices, 3 * spherical.basis_dim(octree.sh_degree)), np.float32)
     for start in range(0, octree.n_vertices, _CHUNK):  # a part at a time: sums take several times what is kept
         part = slice(start, start + _CHUNK)
-        sigma_sum = sh_sum = 0.0
+        sigma_sum, sh_sum = np.zeros_like(sigma[part]), np.zeros_like(sh[part], np.float64)
         for offset in offsets:
             rows = in_chunks(to_sh, positions[part] + spacing[part, None] * offset).astype(np.float64)
             sigma_sum = sigma_sum + rows[:, 0]

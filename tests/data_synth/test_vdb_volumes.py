@@ -1,8 +1,6 @@
 """OpenVDB, npz and raw volumes: round trips, a real file, hostile files."""
 
-import os
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ from data_synth import media
 from data_synth.errors import InputError
 from data_synth.vdb import _Reader, _Tree, read_vdb, write_vdb
 from data_synth.volumes import read_volume, write_density
+from tests.fixtures.real import real_data
 
 
 @pytest.fixture
@@ -120,9 +119,7 @@ def test_written_truth_is_the_extinction(tmp_path, values):
 
 
 def test_a_real_file_reads_exactly():
-    if "NERFVOL_DATA" not in os.environ:
-        pytest.skip("NERFVOL_DATA is not set")
-    folder = Path(os.environ["NERFVOL_DATA"]) / "volumes"
+    folder = real_data("volumes")
     grid = read_vdb(folder / "smoke.vdb")
     with np.load(folder / "smoke_dense_f32.npz") as dense:
         assert np.array_equal(grid.values, dense["density"]) and np.array_equal(grid.first, dense["ijk_min"])

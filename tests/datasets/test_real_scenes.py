@@ -1,25 +1,13 @@
 """The loaders on real scenes made by others, where NERFVOL_DATA says they are."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.load import load_dataset
-
-DATA = os.environ.get("NERFVOL_DATA") or None
-
-
-def scene(name):
-    if DATA is None:
-        pytest.skip("NERFVOL_DATA names no folder of real scenes")
-    folder = Path(DATA) / name
-    if not folder.is_dir():
-        pytest.skip(f"{name} is not in the folder NERFVOL_DATA names")
-    return folder
+from tests.fixtures.real import real_data
 
 
 def visual_hull(dataset, half, n=48):
@@ -35,7 +23,7 @@ def visual_hull(dataset, half, n=48):
 
 @pytest.mark.parametrize("name,size", [("lego", 800), ("chair_400", 400)])
 def test_nerf_synthetic(name, size):
-    dataset = load_dataset(scene(name), "train", downscale=size // 100)
+    dataset = load_dataset(real_data(name), "train", downscale=size // 100)
     assert len(dataset) == 100 and dataset.names[:2] == ["r_0", "r_1"]
     assert dataset.images[0].shape == (100, 100, 4) and dataset.scene.has_alpha
     half = dataset.scene.aabb[1, 0]
@@ -44,13 +32,13 @@ def test_nerf_synthetic(name, size):
     assert not any(image[[0, -1], :, 3].any() or image[:, [0, -1], 3].any() for image in dataset.images)  # nothing cut
     low, high = visual_hull(dataset, half=1.3 * half)
     assert (low > dataset.scene.aabb[0]).all() and (high < dataset.scene.aabb[1]).all()  # the object is inside
-    held = load_dataset(scene(name), "test", downscale=size // 100)
+    held = load_dataset(real_data(name), "test", downscale=size // 100)
     assert len(held) == 20 and "val views are used instead" in held.messages[0]
 
 
 def test_fox_reports_the_photographs_that_are_missing():
-    train, held = (load_dataset(scene("fox"), split, downscale=8) for split in ("train", "val"))
-    listed = json.loads((scene("fox") / "transforms.json").read_text())["frames"]
+    train, held = (load_dataset(real_data("fox"), split, downscale=8) for split in ("train", "val"))
+    listed = json.loads((real_data("fox") / "transforms.json").read_text())["frames"]
     assert len(listed) == 67 and len(train) + len(held) == 50
     assert any("lists 17 images that are not on disk" in message for message in train.messages)
     assert not set(train.names) & set(held.names) and len(held) == 7
@@ -67,7 +55,7 @@ def test_fox_reports_the_photographs_that_are_missing():
 
 
 def test_fern():
-    dataset = load_dataset(scene("fern"))
+    dataset = load_dataset(real_data("fern"))
     assert len(dataset) == 17 and dataset.images[0].shape == (378, 504, 3)
     assert dataset.cameras[0].intrinsics.cx == 252
     assert "between near 16.9" in dataset.messages[-1]
@@ -76,7 +64,7 @@ def test_fern():
 
 
 def test_cup():
-    train, held = (load_dataset(scene("cup"), split) for split in ("train", "val"))
+    train, held = (load_dataset(real_data("cup"), split) for split in ("train", "val"))
     assert len(train) == 67 and len(held) == 10 and train.images[0].shape == (600, 800, 3)
     (lens,) = {camera.intrinsics for camera in train.cameras + held.cameras}
     assert lens.fx == lens.fy and lens.k1 != 0 and lens.k2 == 0  # SIMPLE_RADIAL

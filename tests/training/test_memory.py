@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from nerfvol.datasets.load import load_dataset
+from nerfvol.datasets.tiles import TileBank
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.training import memory
@@ -14,6 +15,7 @@ from nerfvol.training.memory import (
     Beside,
     affordable_leaves,
     estimate_training,
+    gib,
     largest_octree,
     octree_bytes,
     require_memory,
@@ -83,29 +85,44 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
 
 
 def test_images_count(dataset):
-    pixels = 12 * 40 * 40
-    assert estimate_training(dataset, 0, 1).images == int(3.33 * pixels) + 4 * pixels
-    # once the octree is larger than the images that were let go, these count no more
-    assert estimate_training(dataset, 10**6, 1, Beside(0.5, 77)).images == int(1.83 * pixels) + 77
-    # ... and an octree that is there has beside it what is there
-    assert estimate_training(dataset, 10**6, 1, Beside(0.5, 77), 10**6).images == int(1.83 * pixels) + 77 + 4 * pixels
+    """Tiles by what a bank really holds; the files' pixels as long as they cannot be released for a larger octree."""
+    bank = TileBank(dataset, (1.0, 1.0, 1.0), 1)
+    held = [*bank.pixels, bank.row, bank.image, bank.tile, bank.plain, bank.rich_tiles, bank.plain_tiles]
+    share = Beside(rich_share=len(bank.rich_tiles) / len(bank.row), held_out_bytes=77)
+    tiles = sum(array.nbytes for array in held)
+    small, large = (estimate_training(dataset, leaves, 1, share).images for leaves in (0, 10**6))
+    assert large - 77 == pytest.approx(tiles, rel=0.1)
+    assert small == large + dataset.nbytes
+    # An octree that is there has beside it what is there.
+    assert estimate_training(dataset, 10**6, 1, share, vertices=10**6).images == small
+    fixed = dataclasses.replace(dataset, images=dataset.images[:])  # nothing to read these from again
+    assert estimate_training(fixed, 10**6, 1, share).images == small
 
 
 def test_a_field_counts(dataset):
-    """Beside a large octree by what it leaves behind, beside a small one by its distillation."""
-    plain, field = (estimate_training(dataset, 10**7, 1, Beside(field=field)) for field in (False, True))
-    assert field.peak == plain.peak + memory.FIELD_BYTES and "distil" not in plain.sentence()
-    small = estimate_training(dataset, 1, 1, Beside(1.0, 77, field=True))
-    assert small.peak == memory.BASE_BYTES + memory.FIELD_BYTES + memory.DISTILL_BYTES + 77 + dataset.nbytes
-    assert "before that 0.28 GiB to distil the field" in small.sentence()
+    """Beside a large octree by what it leaves behind, whatever its size; beside a small one by its distillation."""
+
+    def estimates(leaves):
+        return (estimate_training(dataset, leaves, 1, Beside(1.0, 77, field=field)) for field in (False, True))
+
+    (plain, field), (larger, larger_field) = estimates(10**7), estimates(2 * 10**7)
+    assert field.peak - plain.peak == larger_field.peak - larger.peak > 0 and "distil" not in plain.sentence()
+    (plain, small), (_, smaller) = estimates(1000), estimates(1)
+    assert small.peak == smaller.peak > field.peak - larger.peak + plain.peak
+    assert small.distillation > dataset.nbytes + 77 and f"before that {gib(small.distillation)}" in small.sentence()
 
 
 def test_an_octree_is_bounded_by_its_surface_the_pixels_and_its_start():
-    assert largest_octree([6], 10**9) == 8**6 and largest_octree([2, 6], 10**9) == 12 * 4**6
-    assert largest_octree([4, 9, 5], 10**9) == 12 * 4**9
-    assert largest_octree([5, 9, 10], 800 * 800) == int(2.2 * 800 * 800)
-    assert largest_octree([5, 9, 10], 800 * 800, photographs=True) == int(0.8 * 800 * 800)
-    assert largest_octree([5, 9, 10], 100) == 8**5
+    plenty, view = 10**9, 800 * 800
+    assert largest_octree([6], plenty) == 8**6  # full from the start, and never more than all cells
+    assert largest_octree([5, 9, 10], 100) == 8**5  # what it begins with, however few pixels
+    for level in (6, 9):  # a surface: four times as many cells for half the side, in whichever stage they are finest
+        assert largest_octree([2, level + 1], plenty) == 4 * largest_octree([2, level], plenty) < 8 ** (level + 1)
+        assert largest_octree([2, level, 4], plenty) == largest_octree([2, level], plenty)
+    bound = largest_octree([5, 9, 10], view)
+    assert view < bound < largest_octree([5, 9, 10], plenty)
+    assert largest_octree([5, 9, 10], 2 * view) == pytest.approx(2 * bound)
+    assert 8**5 < largest_octree([5, 9, 10], view, photographs=True) < bound
 
 
 def test_splits_stay_within_the_bound(capsys):

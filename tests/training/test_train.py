@@ -3,9 +3,7 @@
 import dataclasses
 import gc
 import json
-import os
 import weakref
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +15,7 @@ from nerfvol.training import prepare, session, train
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.prepare import claim_folder
 from nerfvol.views import OctreeModel
+from tests.fixtures.real import real_data
 from tests.fixtures.runs import TINY, Pretended, log_of, run_of, settings, start
 from tests.fixtures.tiny import write_scene
 
@@ -143,7 +142,6 @@ def test_fields_and_octrees_are_compared_on_parts_of_views(tmp_path, tiny_scene,
 
 
 # ---------------------------------------------------------------- a real scene
-@pytest.mark.skipif("NERFVOL_DATA" not in os.environ, reason="NERFVOL_DATA names no folder of real scenes")
 @pytest.mark.parametrize("init", ["direct", "mlp"])
 def test_lego_small(tmp_path, init, command):
     """The whole way on real pictures, an eighth of their size, in a few seconds."""
@@ -156,7 +154,7 @@ def test_lego_small(tmp_path, init, command):
     }  # fmt: skip
     (tmp_path / "plan.yaml").write_text(json.dumps(plan))
     code, out, err = command(
-        "train", "--data", Path(os.environ["NERFVOL_DATA"]) / "lego", "--out", tmp_path / "run", "--downscale", 8,
+        "train", "--data", real_data("lego"), "--out", tmp_path / "run", "--downscale", 8,
         "--init", init, "--config", tmp_path / "plan.yaml",
     )  # fmt: skip
     assert code == 0, err
