@@ -19,7 +19,7 @@ from nerfvol.starts.cloud import LARGEST_SHARE, NEAREST_SHARE, camera_distance, 
 from nerfvol.starts.model_points import model_points
 from nerfvol.starts.random import random_points
 from nerfvol.starts.subject import subject_of
-from tests.datasets import scenes
+from tests.fixtures import scenes
 
 LENS = Intrinsics(40, 30, 35.0, 35.0, 20.0, 15.0)
 
