@@ -12,7 +12,7 @@ from PIL import Image
 import data_synth as ds
 import nerfvol
 from nerfvol.config.training import OctreeConfig
-from nerfvol.datasets import SceneBounds
+from nerfvol.region import SceneBounds
 from nerfvol.training.octree_trainer import OctreeTrainer
 
 
