@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,7 +172,7 @@ def estimate_bytes(cameras: Sequence[Camera], factors: Sequence[int] = FACTORS, 
 
 
 # ------------------------------------------------------------------ back through the lens
-Pictures = Mapping[str, NDArray[Any]]
+Pictures = Mapping[str, NDArray]
 DISTANCES = ("depth", "median_depth")
 SAME_SURFACE = 0.05
 """Distances that differ by a larger share belong to two surfaces."""
