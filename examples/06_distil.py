@@ -26,9 +26,9 @@ trainer = FieldTrainer(dataset, settings, seed=0, background=WHITE)
 for step in range(1, settings.steps + 1):
     report = trainer.step()
     if step % 25 == 0:
-        print(f"step {step}: {report['psnr']:.1f} dB on the batch, {report['samples_per_ray']:.0f} samples a ray")
+        print(f"step {step}: {report.psnr:.1f} dB on the batch, {report.samples:.0f} samples a ray")
 
 settings = DistillConfig(level=5, visibility_downscale=2, compare_downscale=2)
-octree, report = distill(trainer.trained_field(), trainer.domain, dataset, WHITE, settings, trainer.render_camera)
+octree, report = distill(trainer.trained_field(), trainer.domain, dataset, WHITE, settings, trainer.picture)
 print(report)
 save_octree("distilled.safetensors", octree, {"background": WHITE}, "compact")

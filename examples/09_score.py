@@ -11,23 +11,18 @@ from pathlib import Path
 import data_synth as ds
 import nerfvol
 from nerfvol.files import pictures
-from nerfvol.measure.scores import score_views
-from nerfvol.octree.io import load_octree
+from nerfvol.measure.scores import evaluate
 
 SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "until": [0.4, 1.0], "tiles": [64, 96], "prunes": [2, 2]}
 run, scene = (Path(name) for name in (sys.argv[1:3] if len(sys.argv) > 2 else ("run", "scene")))
 if not run.exists():  # a small one
     ds.write_dataset(ds.scenes.Showcase(), scene, ds.Options(views=30, size=(80, 80)))
     nerfvol.train(data=scene, out=run, octree=SHORT)
-octree, metadata = load_octree(run / "octree.safetensors")
-views, background = nerfvol.load_dataset(scene, "test"), metadata["background"]
+model, views = nerfvol.load_model(run), nerfvol.load_dataset(scene, "test")
+background = model.metadata["background"]
+
 pairs = {}
-scores = score_views(
-    lambda camera: nerfvol.render_image(octree, camera, background, outputs=("rgb",))["rgb"],
-    views,
-    background,
-    on_view=lambda i, truth, image: pairs.update({i: (truth, image)}),
-)
+scores = evaluate(model, views, background, on_view=lambda i, truth, image: pairs.update({i: (truth, image)}))
 for row in scores["rows"]:
     print(f"{row['name']:>8}  {row['psnr']:6.2f} dB  {row['ssim']:.4f}")
 print(f"    mean  {scores['psnr']:6.2f} dB  {scores['ssim']:.4f}   over background {background}")

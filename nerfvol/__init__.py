@@ -27,17 +27,18 @@ if TYPE_CHECKING:
     from nerfvol.errors import InputError
     from nerfvol.models import load_model, save_model
     from nerfvol.octree.tree import Octree
+    from nerfvol.splats.splats import Splats
     from nerfvol.views import render_image
 
 __all__ = [
-    "Camera", "Config", "Dataset", "InputError", "Intrinsics", "Octree", "load_dataset", "load_model", "look_at", "orbit",
-    "render_image", "save_model", "train",
+    "Camera", "Config", "Dataset", "InputError", "Intrinsics", "Octree", "Splats", "load_dataset", "load_model",
+    "look_at", "orbit", "render_image", "save_model", "train",
 ]  # fmt: skip
 
 _HOMES = {
     "Camera": "cameras.camera", "Intrinsics": "cameras.camera", "look_at": "cameras.camera", "orbit": "cameras.camera",
     "Config": "config.training", "Dataset": "datasets.dataset", "load_dataset": "datasets.load", "InputError": "errors",
-    "Octree": "octree.tree", "load_model": "models", "save_model": "models", "render_image": "views",
+    "Octree": "octree.tree", "Splats": "splats.splats", "load_model": "models", "save_model": "models", "render_image": "views",
 }  # fmt: skip
 """The module that holds each name; the block above says the same to type checkers."""
 

@@ -90,8 +90,6 @@ def stranger(tiny_scene, tmp_path) -> Path:
 
 @pytest.mark.parametrize("block", SNIPPETS)
 def test_snippet_runs(block, stranger):
-    if "load_model" in block and importlib.util.find_spec("nerfvol.models") is None:
-        pytest.skip("nerfvol.models is not there")
     # a run of two minutes becomes one of ten steps
     (stranger / "snippet.py").write_text(re.sub(r", time_budget=\"\d+m\"", QUICK, block))
     run("snippet.py", cwd=stranger)

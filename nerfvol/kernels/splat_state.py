@@ -21,9 +21,6 @@ from nerfvol.splats.splats import Splats, rotations
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
 
-NEAR_SHARE = 0.02
-"""The near plane as a share of the subject's distance, where nobody says more."""
-
 
 @dataclass(frozen=True)
 class SplatView:
@@ -176,6 +173,8 @@ class SplatState:
     def check(self) -> None:
         """ValueError unless every array fits: the kernels write to them without looking."""
         blocks = packing.n_blocks(self.n)
+        if self.n < 0 or self.origin.shape != (3,) or not np.isfinite(self.origin).all():
+            raise ValueError(f"splat state: expected splats about a place (3,), got {self.n} about {self.origin}")
         rows = self.params.shape[1] if self.params.ndim == 3 else 0
         if rows - packing.SH not in (3, 12, 27, 48):
             raise ValueError(f"splat state: params must be (n_blocks, 11 + 3 K, 16), got {self.params.shape}")
