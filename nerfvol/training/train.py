@@ -114,7 +114,6 @@ def begin_splats(run: Run) -> SplatTrainer:
     schedule = make_schedule_of(run, photographs)
     announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
     splats, distance = start_splats(run, photographs, schedule.most)
-    schedule = dataclasses.replace(schedule, most=max(schedule.most, splats.n))  # a file's splats are all kept
     return SplatTrainer(photographs, splats, config.splats, schedule, distance, config.background, config.seed)
 
 

@@ -76,7 +76,9 @@ def test_more_seconds_give_more_splats_but_no_more_than_pixels_can_teach():
             assert most[-1] <= max(1000, 40 * side * side // PIXELS_PER_SPLAT)
     many = [make_schedule(seconds, [(800, 800)] * 40, True).most for seconds in (8, 15, 30, 60, 120, 600, 1800)]
     assert all(b > 1.2 * a for a, b in zip(many, many[1:], strict=False))
-    assert make_schedule(60, [(800, 800)] * 9 + [(80, 80)], True).most == many[3]  # pixels count, not pictures
+    for sizes in ([(800, 600)] * 3 + [(80, 60)] * 9, [(80, 60)] * 9 + [(800, 600)] * 3):  # pixels count, not pictures
+        pixels = sum(width * height for width, height in sizes)
+        assert make_schedule(1800, sizes, True).most == pixels // PIXELS_PER_SPLAT
 
 
 def test_an_asked_for_number_of_splats_is_that_number():

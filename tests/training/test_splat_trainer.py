@@ -282,6 +282,53 @@ def test_what_is_in_no_photograph_goes_once_all_were_asked(every):
             assert trainer.state.n == (30 if asked else 34), f"after step {step}, every {every}"
 
 
+def test_what_leaves_all_photographs_goes_an_epoch_later():
+    """What was seen once does not count for ever."""
+    trainer = trainer_of(around(5), shell(around(5), 6), grown=0.03001, grow_every=5, prune_opacity=0.0, **STILL)
+    for step in range(6):
+        trainer.step(step / 40)
+    assert trainer.state.n == 30
+    trainer.state.params[0, 2, :3] += 50  # three of them, upwards
+    counts = [trainer.state.n for step in range(6, 16) if trainer.step(step / 40)]
+    assert counts[0] == 30 and counts[-1] == 27
+
+
+def test_a_state_says_where_in_an_epoch_it_was_taken():
+    """Continued in another trainer, the same splats are removed at the same round."""
+    cameras = around(7)
+
+    def begin() -> SplatTrainer:
+        return trainer_of(cameras, shell(cameras, 6, lost=4), grown=0.03001, grow_every=3, prune_opacity=0.0, **STILL)
+
+    for at in range(1, 20):
+        straight, cut = begin(), begin()
+        for step in range(at):
+            straight.step(step / 40)
+            cut.step(step / 40)
+        again = begin()
+        again.load_state_dict(cut.state_dict())
+        for trainer in (straight, again):
+            trainer.state.params[0, 2, :3] += 50
+        for step in range(at, 30):
+            straight.step(step / 40)
+            again.step(step / 40)
+            assert straight.state.n == again.state.n, (at, step)
+
+
+def test_each_round_draws_anew():
+    chosen = set()
+    for steps_done in (5, 10, 15):
+        splats = shell(around(5), 6)
+        trainer = trainer_of(around(5), splats, most=34, prune_opacity=0.0)
+        trainer.steps_done = steps_done
+        trainer.state.per_splat("error")[:] = 1.0
+        trainer.grow(0.59)
+        halves = trainer.state.splats().log_scales.min(axis=1) < np.log(0.1) - 0.1
+        apart = np.linalg.norm(trainer.state.splats().means[halves][:, None] - splats.means[None], axis=2)
+        chosen.add(tuple(sorted(set(apart.argmin(axis=1).tolist()))))
+    assert len(chosen) == 3
+
+
 def test_the_transparent_go_and_the_others_stay():
     cameras = around(5)
     splats = shell(cameras, 10)
@@ -449,6 +496,9 @@ def test_a_start_by_name(tmp_path, photographs_folder, init, sentence):
     start(config, say=said.append)
     line = next(line for line in said if line.startswith("start: "))
     assert sentence in line and ("as asked" in line) == (init != "auto")
+    logits = SplatModel.load(tmp_path / "run" / run_folder.SPLATS).splats.logits
+    opacity = 1 / (1 + np.exp(-float(np.median(logits))))
+    assert opacity == pytest.approx(0.3 if init == "random" else 0.5, abs=0.03)  # one step away from what it began with
     assert metrics_of(tmp_path / "run")["splats"] <= 1200
     assert "1,200 of these points are taken: as many splats as this run may have" in said
 
@@ -479,6 +529,7 @@ def test_a_start_from_a_file(tmp_path, whole):
         out = tmp_path / str(degree)
         start(splat_settings(whole.scene, out, init=str(given), splats={"steps": 1, "sh_degree": degree}))
         after = metrics_of(out)
+        assert SplatModel.load(out / run_folder.SPLATS).packed.sh_degree == degree
         assert after["splats"] == before["splats"] and after["psnr"] > before["psnr"] - 2.5
     sentence = f"--init .*: it has {before['splats']:,} splats, expected 1 to 50"
     with pytest.raises(InputError, match=sentence):
@@ -519,7 +570,8 @@ def test_a_run_goes_on_without_the_file_it_began_with(tmp_path, whole):
     ("octree", "sweep", "expected auto, direct, mlp for octree, got 'sweep'"),
     ("octree", "FILE", "expected auto, direct, mlp for octree, got '.*octree.safetensors'"),
     ("auto", "fog", "expected auto, direct, mlp, points.* or a file of splats, got 'fog'"),
-    ("splats", "FILE", "expected splats, it is a model of octree"), ("auto", "FILE", "expected splats, it is a model of octree"),
+    ("splats", "FILE", "expected splats, it is a model of octree"),
+    ("auto", "FILE", "expected splats, it is a model of octree"),
     ("splats", "points", "the start 'points' cannot be used: .* without the points of a model"),
     ("mesh", "auto", "representation.*octree.*splats"),
 ])  # fmt: skip
