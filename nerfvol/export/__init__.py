@@ -32,7 +32,11 @@ class Export:
     options: tuple[str, ...] = ()
 
 
-EXPORTS: tuple[Export, ...] = ()
+EXPORTS: tuple[Export, ...] = (
+    Export(
+        "splats", (".ply",), "nerfvol.export.splats", ("splats", "points"), "splat viewers (SuperSplat, Spark, Brush)"
+    ),
+)
 """Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another."""
 
 
@@ -61,10 +65,9 @@ def choose(path: str | os.PathLike[str], kind: str, name: str | None = None) -> 
             return row
     wanted = sorted({k for row in rows for k in row.kinds})
     mine = sorted({f"{s} ({row.name})" for row in EXPORTS if kind in row.kinds for s in row.suffixes})
-    hint = ": train with --representation splats" if wanted == ["splats"] and kind == "octree" else ""
-    raise InputError(
-        f"{suffix} ({rows[0].name}) holds {_listed(wanted)}, this is a model of {kind}, which goes to {_listed(mine)}{hint}"
-    )
+    elsewhere = f", which goes to {_listed(mine)}" if mine else ""
+    hint = "; train with --representation splats for it" if "splats" in wanted and kind == "octree" else ""
+    raise InputError(f"{suffix} ({rows[0].name}) holds {_listed(wanted)}, this is a model of {kind}{elsewhere}{hint}")
 
 
 def export_model(
