@@ -36,6 +36,9 @@ EXPORTS: tuple[Export, ...] = (
     Export(
         "splats", (".ply",), "nerfvol.export.splats", ("splats", "points"), "splat viewers (SuperSplat, Spark, Brush)"
     ),
+    Export(
+        "spz", (".spz",), "nerfvol.export.spz", ("splats", "points"), "Niantic's and PlayCanvas' viewers; needs gsply"
+    ),
 )
 """Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another."""
 
