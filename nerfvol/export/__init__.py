@@ -39,6 +39,14 @@ EXPORTS: tuple[Export, ...] = (
     Export(
         "spz", (".spz",), "nerfvol.export.spz", ("splats", "points"), "Niantic's and PlayCanvas' viewers; needs gsply"
     ),
+    Export(
+        "points",
+        (".ply",),
+        "nerfvol.export.points",
+        ("octree", "splats", "points"),
+        "Blender, MeshLab, CloudCompare",
+        ("threshold",),
+    ),
 )
 """Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another."""
 

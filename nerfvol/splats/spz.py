@@ -37,7 +37,7 @@ def _library() -> ModuleType:
         import gsply
     except ImportError as error:
         raise InputError(
-            "files of the kind .spz need the library gsply: pip install 'nerfvol[spz]', or use a .ply"
+            "files of the kind .spz need the library gsply: install it with 'pip install gsply', or write a .ply"
         ) from error
     return gsply
 
