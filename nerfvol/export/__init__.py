@@ -47,6 +47,14 @@ EXPORTS: tuple[Export, ...] = (
         "Blender, MeshLab, CloudCompare",
         ("threshold",),
     ),
+    Export(
+        "grid",
+        (".npz", ".npy"),
+        "nerfvol.export.grid",
+        ("octree",),
+        "numpy and what reads its files",
+        ("resolution", "quantity"),
+    ),
 )
 """Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another."""
 
