@@ -45,6 +45,11 @@ class PointModel:
         self._model = SplatModel(splats_of_points(cloud), metadata)
 
     @property
+    def near(self) -> float:
+        """What is nearer to a camera's plane is not drawn, scene units."""
+        return self._model.near
+
+    @property
     def splats(self) -> Splats:
         """What is drawn, a copy."""
         return self._model.splats
@@ -68,7 +73,7 @@ class PointModel:
             raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
 
         def pinhole(seen: Camera) -> dict[str, Float]:
-            drawn = render_surfaces(splats, view_of(seen, splats.origin, self._model.near), colour, eps)
+            drawn = render_surfaces(splats, view_of(seen, splats.origin, self.near), colour, eps)
             return {name: drawn[name] for name in outputs}
 
         return through_lens(pinhole, camera)
