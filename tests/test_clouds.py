@@ -139,14 +139,21 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-@pytest.mark.parametrize("verb", ["info", "render", "eval"])
+@pytest.mark.parametrize("verb", ["info", "render", "eval", "export", "bench"])
 def test_hostile_files_are_refused_in_a_sentence(tmp_path, command, name, verb):
     data, reason = HOSTILE[name]
     path = tmp_path / f"{name}.ply"
     path.write_bytes(data)
-    options = {"info": [], "render": ["--orbit", 1, "--out", tmp_path / "o"], "eval": ["--data", tmp_path]}[verb]
+    options = {
+        "info": [], "render": ["--orbit", 1, "--out", tmp_path / "o"], "eval": ["--data", tmp_path],
+        "export": ["--out", tmp_path / "out.ply"], "bench": ["--sizes", 16],
+    }[verb]  # fmt: skip
     code, _, err = command(verb, path, *options)
     assert code == 2 and reason in err and err.count("\n") == 1 and str(path) in err
+
+
+def test_unknown_columns_are_ignored(tmp_path):
+    assert load_model(points_file(tmp_path / "p.ply", confidence=np.full(40, np.nan))).describe()["points"] == 40
 
 
 def test_no_gaussians_and_neither_kind_of_file(tmp_path, command):

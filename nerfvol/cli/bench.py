@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from nerfvol import __version__
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
@@ -25,6 +25,12 @@ class BenchOptions:
     plot: str | None = None
     runs: tuple[str, ...] = ()
     threads: int = 0
+    ladder: str | None = None
+    out: str = ""
+    budgets: tuple[str, ...] = ("10s", "30s", "1m", "2m", "5m", "15m")
+    representations: tuple[Literal["octree", "splats"], ...] = ("octree", "splats")
+    published: Literal["none", "lego", "bonsai"] = "none"
+    settings: str | None = None
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
@@ -36,10 +42,19 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--json", metavar="FILE", help="write every figure as JSON")
     p.add_argument("--plot", metavar="FILE", help="draw the curves (.png, .svg or .pdf; needs nerfvol[plot])")
     p.add_argument("--runs", metavar="RUN", nargs="+", help="with --plot: also PSNR against seconds of these runs")
+    p.add_argument("--ladder", metavar="DATA", help="instead of measuring a model: train on DATA for each of --budgets and "
+                   "--representations, and write ladder.json, .md and .png; what is finished is not trained again")  # fmt: skip
+    p.add_argument("--out", metavar="DIR", help="with --ladder: the folder of its runs")
+    p.add_argument("--budgets", metavar="LIST", help="with --ladder (default: 10s,30s,1m,2m,5m,15m; also 500steps)")
+    p.add_argument("--representations", metavar="LIST", help="with --ladder (default: octree,splats)")
+    p.add_argument("--published", metavar="lego|bonsai|none", help="with --ladder: others' figures for comparison")
+    p.add_argument("--settings", metavar="FILE", help="with --ladder: YAML of training settings that all runs share")
 
 
 def run(options: BenchOptions) -> int:
     """Measure everything, print tables, write JSON where asked."""
+    if options.ladder is not None:
+        return run_ladder(options)
     need("bench", target=options.target)
     from nerfvol.files.atomic import write_json
     from nerfvol.machine import describe_hardware
@@ -177,9 +192,55 @@ def _print_roofline(record: dict[str, Any]) -> None:
         )
 
 
+def run_ladder(options: BenchOptions) -> int:
+    """Train what is not there yet, one after the other, and write what came of it."""
+    if options.target:
+        raise InputError("nerfvol bench takes either RUN|FILE or --ladder DATA, not both")
+    need("bench --ladder", ladder=options.ladder, out=options.out)
+    import time
+    from pathlib import Path
+
+    from nerfvol.config.assemble import assemble, read_yaml, to_plain
+    from nerfvol.config.training import Config
+    from nerfvol.files.atomic import read_json
+    from nerfvol.machine import describe_hardware
+    from nerfvol.measure import ladder
+
+    if not Path(str(options.ladder)).exists():
+        raise InputError(f"--ladder {options.ladder}: no such folder or file")
+    budgets = ladder.budgets(options.budgets)
+    shared = (read_yaml(options.settings), options.settings) if options.settings else ({}, "settings")
+    prepare_outputs(folder=options.out)
+    threads = set_threads(options.threads)
+    configs = {}  # all settings are checked before the first run begins
+    for name in options.representations:
+        for budget, settings in budgets.items():
+            folder = Path(options.out) / f"{name}_{budget}"
+            own = {"data": options.ladder, "out": str(folder), "representation": name, "threads": options.threads}
+            configs[name, budget] = folder, assemble(Config, shared, (settings, "--budgets"), (own, "bench"))
+    rows: list[dict[str, Any]] = []
+    for (name, budget), (folder, config) in configs.items():
+        metrics = ladder.finished(folder, to_plain(config))
+        print(f"{name}, {budget}: {'finished before' if metrics else 'training'}", flush=True)
+        if metrics is None:
+            from nerfvol.training.train import train
+
+            train(config, started=time.perf_counter())
+            metrics = read_json(folder / "metrics.json")
+        rows.append(ladder.row_of(name, budget, folder, metrics))
+        record = {
+            "nerfvol": __version__, "hardware": describe_hardware(), "threads": threads, "data": options.ladder,
+            "rows": rows, "published": ladder.PUBLISHED[options.published],
+        }  # fmt: skip
+        written = ladder.write_ladder(Path(options.out), record)  # after each run: the next may take long
+    print(f"\n{ladder.table(record)}\nwritten: {', '.join(map(str, written))}")
+    return 0
+
+
 COMMAND = Command(
     summary="Measure rendering, loading and training speed.",
-    example="nerfvol bench run --sizes 400,800 --json bench.json --plot bench.png",
+    example="nerfvol bench run --sizes 400,800 --json bench.json --plot bench.png\n"
+    "nerfvol bench --ladder scene --out ladder --budgets 30s,2m",
     options=BenchOptions,
     arguments=arguments,
     run=run,
