@@ -208,6 +208,8 @@ def run_ladder(options: BenchOptions) -> int:
 
     if not Path(str(options.ladder)).exists():
         raise InputError(f"--ladder {options.ladder}: no such folder or file")
+    if not options.representations:
+        raise InputError("--representations: expected octree, splats or both")
     budgets = ladder.budgets(options.budgets)
     shared = (read_yaml(options.settings), options.settings) if options.settings else ({}, "settings")
     prepare_outputs(folder=options.out)

@@ -32,7 +32,7 @@ DEPTH = 3.0
 DISC = 0.05
 """A splat whose thinnest scale is a smaller share of its widest has a plane."""
 MOST_SURFACES = 64
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating]
 
 
 @dataclass(frozen=True)

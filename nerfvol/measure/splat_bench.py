@@ -18,7 +18,7 @@ from nerfvol.defaults import DEFAULT_EARLY_STOP, WHITE
 from nerfvol.kernels import ops, splat_ops
 from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatState, view_of
 from nerfvol.measure.bench import median_seconds
-from nerfvol.models import Model, load_model
+from nerfvol.models import load_model
 from nerfvol.splats.packing import pack
 from nerfvol.views import SplatModel
 
@@ -59,7 +59,7 @@ def measure(
     return rows
 
 
-def _frame_seconds(model: Model, cameras: Sequence[Camera], repeats: int) -> float:
+def _frame_seconds(model: SplatModel | PointModel, cameras: Sequence[Camera], repeats: int) -> float:
     def frame(index: int) -> object:
         return model.render(cameras[index % len(cameras)], WHITE, ("rgb",), DEFAULT_EARLY_STOP)
 
