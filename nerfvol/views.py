@@ -182,7 +182,7 @@ class SplatModel:
             raise InputError(f"{path} holds no Gaussians, so there is nothing to draw")
         return cls(splats)
 
-    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
+    def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
         """See models.Model; splats have one storage."""
         return save_splats(path, self.splats, self.metadata)
 

@@ -221,6 +221,8 @@ def run_ladder(options: BenchOptions) -> int:
             own = {"data": options.ladder, "out": str(folder), "representation": name, "threads": options.threads}
             configs[name, budget] = folder, assemble(Config, shared, (settings, "--budgets"), (own, "bench"))
     rows: list[dict[str, Any]] = []
+    record: dict[str, Any] = {}
+    written: list[Path] = []
     for (name, budget), (folder, config) in configs.items():
         metrics = ladder.finished(folder, to_plain(config))
         print(f"{name}, {budget}: {'finished before' if metrics else 'training'}", flush=True)
