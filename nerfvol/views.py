@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.cameras.through_lens import through_lens
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
+from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.kernels.splat_ops import render_splats
 from nerfvol.kernels.splat_state import view_of
@@ -21,7 +23,9 @@ from nerfvol.octree.io import Storage, load_octree, save_octree
 from nerfvol.octree.tree import Octree
 from nerfvol.splats.io import load_splats, save_splats
 from nerfvol.splats.packing import PackedSplats, as_packed, unpack
+from nerfvol.splats.ply import load_ply
 from nerfvol.splats.splats import Splats
+from nerfvol.splats.spz import load_spz
 
 if TYPE_CHECKING:
     from nerfvol.models import Model
@@ -153,7 +157,7 @@ class SplatModel:
 
     def __init__(self, splats: Splats | PackedSplats, metadata: Mapping[str, Any] | None = None) -> None:
         self.packed, self.metadata = as_packed(splats), dict(metadata or {})
-        self._near = float(self.metadata.get("near") or NEAREST * self._extent())
+        self.near = float(self.metadata.get("near") or NEAREST * self._extent())
 
     @property
     def splats(self) -> Splats:
@@ -169,10 +173,16 @@ class SplatModel:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SplatModel:
-        """The model in a file of splats; InputError where it is none."""
-        return cls(*load_splats(path))
+        """The model in a file of splats, our own or, by its suffix, .ply or .spz; InputError where it is none."""
+        reader = {".ply": load_ply, ".spz": load_spz}.get(Path(path).suffix.lower())
+        if reader is None:
+            return cls(*load_splats(path))
+        splats = reader(path)
+        if not splats.n:
+            raise InputError(f"{path} holds no Gaussians, so there is nothing to draw")
+        return cls(splats)
 
-    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
+    def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
         """See models.Model; splats have one storage."""
         return save_splats(path, self.splats, self.metadata)
 
@@ -188,7 +198,7 @@ class SplatModel:
         colour = self.metadata.get("background", WHITE) if background is None else background
 
         def pinhole(seen: Camera) -> dict[str, Float]:
-            view = view_of(seen, self.packed.origin, self._near)
+            view = view_of(seen, self.packed.origin, self.near)
             return render_splats(self.packed, view, colour, early_stop_eps, outputs)
 
         return through_lens(pinhole, camera)
