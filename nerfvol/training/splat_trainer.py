@@ -171,7 +171,9 @@ class SplatTrainer:
             state.prune(keep)
         growing = progress < self.schedule.grown
         wanted = self.schedule.planned(self.started_with, progress) - state.n if growing else 0
-        state.grow(wanted, np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, SPLITS, self.steps_done]))))
+        state.grow(
+            wanted, np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, SPLITS, self.steps_done])))
+        )
         state.reorder()
 
     def take_model(self, metadata: dict[str, Any]) -> SplatModel:
