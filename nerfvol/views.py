@@ -157,7 +157,10 @@ class SplatModel:
 
     def __init__(self, splats: Splats | PackedSplats, metadata: Mapping[str, Any] | None = None) -> None:
         self.packed, self.metadata = as_packed(splats), dict(metadata or {})
-        self.near = float(self.metadata.get("near") or NEAREST * self._extent())
+        near = self.metadata.get("near")
+        if near is not None and (type(near) not in (int, float) or not 0 < near < np.inf):
+            raise InputError(f"splats: near must be a positive number, got {near!r:.60}")
+        self.near = NEAREST * self._extent() if near is None else float(near)
 
     @property
     def splats(self) -> Splats:
@@ -171,16 +174,31 @@ class SplatModel:
         rows = [self.packed.params[:, k].reshape(-1)[: self.packed.n] for k in range(3)]
         return float(max(np.subtract(*np.quantile(row, (0.9, 0.1))) for row in rows)) / 2 or 1.0
 
+    @functools.cached_property
+    def _corners(self) -> NDArray[np.float64]:
+        """(8, 3) of the box around all means, relative to the origin."""
+        rows = [self.packed.params[:, k].reshape(-1)[: self.packed.n] for k in range(3)]
+        ends = [(float(row.min()), float(row.max())) for row in rows]
+        return np.array(np.meshgrid(*ends, indexing="ij")).reshape(3, 8).T
+
+    def _nearest(self, camera: Camera) -> float:
+        """Less than the depth of anything; the kernels tell depths apart over 16 octaves behind the near plane, so that a
+        camera far away needs a far one."""
+        if not self.packed.n:
+            return 0.0
+        return 0.99 * float(((self._corners + self.packed.origin - camera.position) @ camera.forward).min())
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SplatModel:
         """The model in a file of splats, our own or, by its suffix, .ply or .spz; InputError where it is none."""
         reader = {".ply": load_ply, ".spz": load_spz}.get(Path(path).suffix.lower())
-        if reader is None:
-            return cls(*load_splats(path))
-        splats = reader(path)
+        splats, metadata = load_splats(path) if reader is None else (reader(path), {})
         if not splats.n:
             raise InputError(f"{path} holds no Gaussians, so there is nothing to draw")
-        return cls(splats)
+        try:
+            return cls(splats, metadata)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
         """See models.Model; splats have one storage."""
@@ -198,7 +216,11 @@ class SplatModel:
         colour = self.metadata.get("background", WHITE) if background is None else background
 
         def pinhole(seen: Camera) -> dict[str, Float]:
+<<<<<<< HEAD
             view = view_of(seen, self.packed.origin, self.near)
+=======
+            view = view_of(seen, self.packed.origin, max(self.near, self._nearest(seen)))
+>>>>>>> next-tests
             return render_splats(self.packed, view, colour, early_stop_eps, outputs)
 
         return through_lens(pinhole, camera)

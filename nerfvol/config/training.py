@@ -312,7 +312,9 @@ class Config:
     """Section: Gaussian splats and their optimisation (config.splats)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError where ``init`` is no start of the representation."""
+        """Raises InputError where ``init`` is no start of the representation; a resumed run needs its file no more."""
+        if self.resume:
+            return
         known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS}
         names = known.get(self.representation, OCTREE_STARTS + SPLAT_STARTS)
         is_file = self.representation != "octree" and Path(self.init).exists()

@@ -173,6 +173,8 @@ class SplatState:
     def check(self) -> None:
         """ValueError unless every array fits: the kernels write to them without looking."""
         blocks = packing.n_blocks(self.n)
+        if self.n < 0 or self.origin.shape != (3,) or not np.isfinite(self.origin).all():
+            raise ValueError(f"splat state: expected splats about a place (3,), got {self.n} about {self.origin}")
         rows = self.params.shape[1] if self.params.ndim == 3 else 0
         if rows - packing.SH not in (3, 12, 27, 48):
             raise ValueError(f"splat state: params must be (n_blocks, 11 + 3 K, 16), got {self.params.shape}")

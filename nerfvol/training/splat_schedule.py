@@ -7,8 +7,9 @@ teaches the same; growth early, for a Gaussian must still be optimised; and no m
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 SECONDS_PER_STEP = 1 / 80
 """Of a run without a time budget: what its steps would take on two cores, for the tables below."""
@@ -72,6 +73,19 @@ def make_schedule(
     affordable = int(_at(_PHOTOGRAPHS if photographs else _OBJECTS, seconds))
     wanted = most if most is not None else min(affordable, max(1000, pixels // PIXELS_PER_SPLAT))
     return Schedule(factors, (*ends, 1.0), wanted, _at(_GROWN, seconds))
+
+
+def saved_schedule(state: Mapping[str, Any]) -> Schedule:
+    """The schedule in a trainer's state; LookupError, TypeError or ValueError where there is none."""
+    factors, ends = tuple(int(f) for f in state["factors"]), tuple(float(e) for e in state["ends"])
+    schedule = Schedule(factors, ends, int(state["most"]), float(state["grown"]))
+    halved = tuple(2**k for k in range(len(factors) - 1, -1, -1))
+    in_order = all(0 <= a <= b <= 1 for a, b in zip((0.0, *ends), ends, strict=False))
+    if not 1 <= len(factors) == len(ends) <= 7 or factors != halved or not in_order or ends[-1] != 1:
+        raise ValueError(f"sizes {factors} until {ends} are no schedule")
+    if schedule.most < 1 or not schedule.grown > GROWTH_STARTS:
+        raise ValueError(f"growth to {schedule.most} until {schedule.grown} is no schedule")
+    return schedule
 
 
 def _at(values: Sequence[float], seconds: float) -> float:

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels.splat_state import SplatState
@@ -10,23 +16,35 @@ from nerfvol.starts.choose import STARTS, choose_start
 from nerfvol.starts.cloud import splats_of_cloud
 from nerfvol.starts.subject import subject_of
 from nerfvol.training.session import Run
-from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule
+from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule, saved_schedule
 
 OBJECT_OPACITY = 0.3
 """Random points are mostly nowhere: they begin fainter than points that were found."""
 
 
 def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
-    """The schedule of the seconds that the run has left, or of its steps."""
+    """The schedule of the seconds that the run has left, or of its steps; a resumed run's is the checkpoint's."""
     config = run.config
+    if run.phase == "splats":
+        with _saved_of(run) as saved:
+            return saved_schedule(saved)
     left = run.seconds_left()
     seconds = config.splats.steps * SECONDS_PER_STEP if left is None else left
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
     return make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
 
 
-def start_splats(run: Run, photographs: Photographs) -> tuple[Splats, float]:
-    """The splats to begin with, and the median camera's distance to the subject, scene units.
+@contextlib.contextmanager
+def _saved_of(run: Run) -> Iterator[dict[str, Any]]:
+    """The trainer's state in the checkpoint; InputError where what is looked up in it is not there or does not fit."""
+    try:
+        yield run.saved["trainer"]
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{run.checkpoint} does not fit the splats of this run: {error}") from error
+
+
+def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats, float]:
+    """The splats to begin with, at most ``most`` of points; and the median camera's distance to the subject, scene units.
 
     Raises:
         InputError: the start that ``init`` names is unknown or finds nothing.
@@ -34,15 +52,18 @@ def start_splats(run: Run, photographs: Photographs) -> tuple[Splats, float]:
     config, dataset = run.config, run.data.training
     degree = config.splats.sh_degree or 0
     if run.phase == "splats":  # the checkpoint has them
-        saved = run.saved["trainer"]
-        return SplatState.from_arrays(saved).splats(), float(saved["subject_distance"])
+        with _saved_of(run) as saved:
+            return SplatState.from_arrays(saved).splats(), float(saved["subject_distance"])
     if config.init not in ("auto", *STARTS):
         return _from_file(run, config.init, degree), subject_of(dataset).distance
     start = choose_start(dataset, photographs, None if config.init == "auto" else config.init, config.seed)
     run.say(start.sentence)
     opacity = OBJECT_OPACITY if start.name == "random" else 0.5
-    distance = start.subject.distance
-    return splats_of_cloud(start.cloud, photographs.cameras, distance, degree, config.splats.mode, opacity), distance
+    distance, cloud = start.subject.distance, start.cloud
+    if len(cloud) > most:
+        cloud = cloud[np.sort(np.random.default_rng(config.seed).permutation(len(cloud))[:most])]
+        run.say(f"{most:,} of these points are taken: as many splats as this run may have")
+    return splats_of_cloud(cloud, photographs.cameras, distance, degree, config.splats.mode, opacity), distance
 
 
 def _from_file(run: Run, path: str, degree: int) -> Splats:
@@ -53,5 +74,8 @@ def _from_file(run: Run, path: str, degree: int) -> Splats:
     model = load_model(path)
     if not isinstance(model, SplatModel):
         raise InputError(f"--init {path}: expected splats, it is a model of {model.kind}")
-    run.say(f"start: the {model.packed.n:,} splats of {path}")
+    n, most = model.packed.n, run.config.splats.max_splats
+    if not n or (most is not None and n > most):
+        raise InputError(f"--init {path}: it has {n:,} splats, expected 1 to {most or 'any number':,}")
+    run.say(f"start: the {n:,} splats of {path}")
     return model.splats.with_sh_degree(degree)

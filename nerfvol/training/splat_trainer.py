@@ -22,7 +22,7 @@ from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatState, vi
 from nerfvol.kernels.state import StepReport
 from nerfvol.splats.packing import LOGIT
 from nerfvol.splats.splats import Splats
-from nerfvol.training.splat_schedule import Schedule
+from nerfvol.training.splat_schedule import Schedule, saved_schedule
 from nerfvol.views import SplatModel
 
 VIEWS, SPLITS = 3, 4
@@ -108,9 +108,12 @@ class SplatTrainer:
         self.state = SplatState.from_arrays(state)
         for name in ("stage", "steps_done", "started_with", "seen_since"):
             setattr(self, name, int(state[name]))
-        factors, ends = tuple(int(f) for f in state["factors"]), tuple(float(e) for e in state["ends"])
-        self.schedule = Schedule(factors, ends, int(state["most"]), float(state["grown"]))
+        self.schedule = saved_schedule(state)
         self.subject_distance = float(state["subject_distance"])
+        if not 0 <= self.stage < len(self.schedule.factors) or min(self.steps_done, self.seen_since) < 0:
+            raise ValueError(f"stage {self.stage} and step {self.steps_done} are not in its schedule")
+        if min(self.state.n, self.started_with) < 1 or not 0 < self.subject_distance < math.inf:
+            raise ValueError(f"{self.state.n} splats, begun with {self.started_with}, at {self.subject_distance}")
 
     # ------------------------------------------------------------------ the schedule
     def step(self, progress: float) -> StepReport:
@@ -157,8 +160,8 @@ class SplatTrainer:
     def grow(self, progress: float) -> None:
         """Removes what is nearly transparent or in no photograph, and splits what holds the error, up to the plan."""
         state = self.state
-        keep = state.row(LOGIT) > math.log(self.config.prune_opacity / (1 - self.config.prune_opacity))
-        if self.seen_since >= len(self.photographs):  # each photograph was asked
+        keep = _opacity(state.row(LOGIT)) >= self.config.prune_opacity
+        if self._all_were_asked():
             keep &= state.per_splat("seen") > 0
             self.seen_since = 0
             state.seen[...] = 0
@@ -176,8 +179,18 @@ class SplatTrainer:
         )
         state.reorder()
 
+    def _all_were_asked(self) -> bool:
+        """Whether a whole epoch passed since ``seen`` was reset: rounds do not begin where epochs do."""
+        n = len(self.photographs)
+        first = -(-(self.steps_done - self.seen_since) // n) * n
+        return first + n <= self.steps_done
+
     def take_model(self, metadata: dict[str, Any]) -> SplatModel:
         """The splats without those that are nearly transparent."""
         splats = self.state.splats()
-        seen = 1 / (1 + np.exp(-splats.logits.astype(np.float64))) >= self.config.prune_opacity
+        seen = _opacity(splats.logits) >= self.config.prune_opacity
         return SplatModel(splats.select(seen) if seen.any() else splats, {**metadata, **self.metadata()})
+
+
+def _opacity(logits: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-logits.astype(np.float64)))

@@ -41,7 +41,7 @@ from nerfvol.views import OctreeModel
 PRODUCT = {"octree": run_folder.OCTREE, "splats": run_folder.SPLATS}
 WHY = {
     "octree": "an object on a transparent background, or asked for by --init",
-    "splats": "photographs, which splats draw sharper and sooner",
+    "splats": "photographs, which splats draw sharper and sooner, or asked for by --init",
 }
 LOG_EVERY = 50
 """Steps between two lines of the log."""
@@ -113,7 +113,8 @@ def begin_splats(run: Run) -> SplatTrainer:
         run.say(message)
     schedule = make_schedule_of(run, photographs)
     announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
-    splats, distance = start_splats(run, photographs)
+    splats, distance = start_splats(run, photographs, schedule.most)
+    schedule = dataclasses.replace(schedule, most=max(schedule.most, splats.n))  # a file's splats are all kept
     return SplatTrainer(photographs, splats, config.splats, schedule, distance, config.background, config.seed)
 
 
