@@ -216,11 +216,7 @@ class SplatModel:
         colour = self.metadata.get("background", WHITE) if background is None else background
 
         def pinhole(seen: Camera) -> dict[str, Float]:
-<<<<<<< HEAD
-            view = view_of(seen, self.packed.origin, self.near)
-=======
             view = view_of(seen, self.packed.origin, max(self.near, self._nearest(seen)))
->>>>>>> next-tests
             return render_splats(self.packed, view, colour, early_stop_eps, outputs)
 
         return through_lens(pinhole, camera)
