@@ -14,7 +14,7 @@ from nerfvol.errors import InputError
 from nerfvol.octree.io import load_octree
 
 SOURCE = Path(nerfvol.__file__)
-FEW = {"levels": [3, 4], "downscales": [2, 1], "until": [0.5, 1.0], "tiles": [8, 8], "prunes": [1, 1], "steps": 12}
+FEW = {"levels": [3, 4], "downscales": [2, 1], "stage_ends": [0.5, 1.0], "tiles": [8, 8], "prunes": [1, 1], "steps": 12}
 """Sections of a run of no length."""
 
 

@@ -98,7 +98,7 @@ class OccupancyGrid:
         if not bool(self.occupied.any()):
             raise InputError(
                 "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
-                "the images' background and that the scene bounds contain the object, lower field.learning_rate or "
+                "the images' background and that the scene bounds contain the object, lower field.rate or "
                 "field.sparsity_weight, or start with --init direct"
             )
 

@@ -8,8 +8,8 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.octree.tree import Octree
 
 
-def thin_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
-    """A nearly transparent octree: 2**level cells along the detail cube, then shells of doubling cells to the horizon.
+def low_density_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
+    """A nearly transparent octree: 2**level cells along the inner cube, then shells of doubling cells to the horizon.
 
     Each shell reaches twice as far as the one inside it with cells twice as large, so that cells look about equally
     large from the middle. Right before the lenses there is nothing (Dataset.before_a_lens).

@@ -193,7 +193,7 @@ class FieldTrainer:
         self.schedules = [StepSchedule(self.domain, n) for n in config.march_steps]
         self.schedule = self.schedules[-1]
         self.optimizer = torch.optim.Adam(
-            self.field.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
+            self.field.parameters(), lr=config.rate, betas=(0.9, 0.99), eps=1e-15, fused=True
         )
         self.steps_done, self.stage = 0, 0  # an image scale is no stage: nothing else changes with it
         self.n_rays = max(1, min(config.max_rays, config.samples_per_step // 64))
@@ -201,7 +201,7 @@ class FieldTrainer:
 
     # ------------------------------------------------------------------ what a run asks of a phase
     name = "field"
-    rates = "field.learning_rate"
+    rates = "field.rate"
     previews = (0.1, 0.4, 1.0)
     preview_width = 100  # a field renders slowly
     stages_left = 0
@@ -273,7 +273,7 @@ class FieldTrainer:
         config = self.config
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         generator = step_generator(self.seed, self.steps_done)
-        self._set_learning_rate(progress)
+        self._set_rate(progress)
         stage = self._stage_at(progress)
         bank, self.schedule = self._bank(stage), self.schedules[stage]
         rays_o, rays_d, target = bank.sample(self.n_rays, generator)
@@ -341,11 +341,11 @@ class FieldTrainer:
             self._banks = {downscale: PixelBank(self.dataset, self.background.tolist(), downscale)}
         return self._banks[downscale]
 
-    def _set_learning_rate(self, progress: float) -> None:
+    def _set_rate(self, progress: float) -> None:
         warm = min(1.0, (self.steps_done + 1) / 20)
-        decay = self.config.final_learning_rate ** max(0.0, (progress - 1 / 3) * 1.5)
+        decay = self.config.rate_decay ** max(0.0, (progress - 1 / 3) * 1.5)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * warm * decay
+            group["lr"] = self.config.rate * warm * decay
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that lives between steps, as tensors and numbers."""

@@ -15,7 +15,7 @@ from nerfvol.config.splats import SplatConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs, estimate_bytes
-from nerfvol.datasets.tiles import rich_share
+from nerfvol.datasets.tiles import foreground_share
 from nerfvol.errors import InputError
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
@@ -38,8 +38,8 @@ VERTICES_PER_LEAF = 1.65
 """Vertices of an octree that was split where it pays, for each leaf: measured on lego, 1.5 to 1.7 at every size."""
 BEFORE_SHARE = 0.4
 """Of the leaves of the largest octree: those that the octree before it had, which is in memory while its leaves are split."""
-RICH_BYTES_PER_PIXEL = 3
-"""Per training pixel in a tile that is not plain background: 8-bit RGB."""
+FOREGROUND_BYTES_PER_PIXEL = 3
+"""Per training pixel in a foreground tile: 8-bit RGB."""
 TILE_BYTES_PER_PIXEL = 0.33
 """Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool)."""
 LEAVES_PER_PIXEL = 2.2
@@ -57,11 +57,11 @@ SHARE = 0.9
 class Beside:
     """What a run holds beside the octree and its training images.
 
-    rich_share: of the training tiles, those that are not plain background. held_out_bytes: of images. field: whether the
+    foreground_share: of the training tiles, those of the foreground. held_out_bytes: of images. field: whether the
     octree comes from a field.
     """
 
-    rich_share: float = 1.0
+    foreground_share: float = 1.0
     held_out_bytes: int = 0
     field: bool = False
 
@@ -128,7 +128,7 @@ def estimate_training(
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
     octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
     growth = 0 if not dataset.can_reload or vertices is not None else change + octree // 2
-    tiles = int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
+    tiles = int((TILE_BYTES_PER_PIXEL + FOREGROUND_BYTES_PER_PIXEL * beside.foreground_share) * pixels)
     return MemoryEstimate(
         base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
         images=tiles + beside.held_out_bytes + max(0, dataset.nbytes - growth),
@@ -221,15 +221,15 @@ def splat_memory(photographs: Photographs, schedule: Schedule, config: SplatConf
 class OctreePlan:
     """How large the octree of a run may become, and what memory that takes beside everything else.
 
-    Attributes: max_leaves, a bound on splitting; rich_tiles, about so many training tiles are not plain background.
+    Attributes: max_leaves, a bound on splitting; foreground_tiles, about so many training tiles show more than the background.
     """
 
     def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int) -> None:
         """Raises InputError where not even a coarse octree fits in the memory at hand."""
         self._dataset, lens = dataset, dataset.cameras[0].intrinsics
-        share = rich_share(dataset, config.background)
+        share = foreground_share(dataset, config.background)
         pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
-        self.rich_tiles = max(share, 0.01) * pixels / TILE_RAYS
+        self.foreground_tiles = max(share, 0.01) * pixels / TILE_RAYS
         self._beside = Beside(share, held_out_bytes, field=config.init == "mlp")
         self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)

@@ -17,7 +17,7 @@ import numpy as np
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.tiles import Cursor, TileBank
+from nerfvol.datasets.tiles import Cursors, TileBank
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
@@ -25,7 +25,7 @@ from nerfvol.octree.rows import convert_rows
 from nerfvol.octree.topology import Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
-from nerfvol.starts.fog import thin_octree
+from nerfvol.starts.fog import low_density_octree
 from nerfvol.training.memory import OctreePlan, splits_within
 from nerfvol.views import OctreeModel, render_image
 
@@ -63,18 +63,14 @@ class OctreeTrainer:
         plan: OctreePlan | None = None,
     ):
         config = config.for_scene(dataset.scene)
-        n = len(config.levels)
-        for name in ("downscales", "until", "tiles", "prunes"):
-            if len(getattr(config, name)) != n:
-                raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
-        self.octree = octree if octree is not None else self._thin_start()
+        self.octree = octree if octree is not None else self._low_density_start()
         self.state = ops.TrainState(self.octree)
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
         self.steps_done = 0
-        self.rich, self.plain = Cursor(), Cursor()
+        self.cursors = Cursors()
         self.prunings = 0
         self.tiles_seen = 0
         self.bank: TileBank | None = None
@@ -82,11 +78,11 @@ class OctreeTrainer:
         self.max_leaves = plan.max_leaves if plan else None
         """Bound on splitting, where memory is short; None: none."""
         self.steps = config.steps
-        drawn = config.tiles[-1] * (config.rich_share or 1.0)
-        self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.rich_tiles / drawn) if plan else math.inf
+        drawn = config.tiles[-1] * (config.foreground_share or 1.0)
+        self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.foreground_tiles / drawn) if plan else math.inf
 
-    def _thin_start(self) -> Octree:
-        return thin_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
+    def _low_density_start(self) -> Octree:
+        return low_density_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
 
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
@@ -129,7 +125,7 @@ class OctreeTrainer:
     @property
     def _start(self) -> float:
         """The share of the schedule that a given octree skips."""
-        return self.config.until[self.first_stage - 1] if self.first_stage else 0.0
+        return self.config.stage_ends[self.first_stage - 1] if self.first_stage else 0.0
 
     def state_dict(self) -> dict:
         """Everything an exact continuation needs: arrays, numbers and strings."""
@@ -140,7 +136,7 @@ class OctreeTrainer:
             "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
             "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
             "prunings": self.prunings, "tiles_seen": self.tiles_seen,
-            "rich": dataclasses.asdict(self.rich), "plain": dataclasses.asdict(self.plain),
+            "cursors": dataclasses.asdict(self.cursors),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
@@ -160,7 +156,7 @@ class OctreeTrainer:
             setattr(self.state, name, np.array(state[name], dtype=np.float32))
         for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
-        self.rich, self.plain = Cursor(**state["rich"]), Cursor(**state["plain"])
+        self.cursors = Cursors.of(state["cursors"])
         # The bank says when enough was seen to prune: where it stood before, it must stand at once.
         self.bank = None if self.steps_done == 0 else self._make_bank()
 
@@ -168,26 +164,26 @@ class OctreeTrainer:
         """One step at ``progress`` in [0, 1] of the run."""
         c = self.config
         progress = self._start + progress * (1 - self._start)
-        if progress >= c.until[self.stage] and self.stage + 1 < len(c.levels):
+        if progress >= c.stage_ends[self.stage] and self.stage + 1 < len(c.levels):
             if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
                 self.next_stage()
         self._prune_inside_stage(progress)
         if self.bank is None:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
-        smooth = fade if self.steps_done >= c.smooth_from else 0.0
+        smooth = fade if self.steps_done >= c.tv_from else 0.0
         options = ops.LossOptions(
             background=self._behind(),
-            colour=c.colour * fade,
+            colour=c.colour_weight * fade,
             distortion=c.distortion * fade,
-            tv_density=c.smooth_density * smooth,
-            tv_sh=c.smooth_colour * smooth,
+            tv_density=c.tv_density * smooth,
+            tv_sh=c.tv_sh * smooth,
             early_stop_eps=c.early_stop_eps,
         )
         late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
         rate = c.rate_decay**late
         rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=c.beta)
-        batch = self.bank.draw(c.tiles[self.stage], c.rich_share, self.seed, self.rich, self.plain)
+        batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
         self.steps_done += 1
         self.tiles_seen += c.tiles[self.stage]
@@ -222,7 +218,7 @@ class OctreeTrainer:
             self._grow_sh(c.final_sh_degree)
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
-            self.rich, self.plain = Cursor(), Cursor()
+            self.cursors = Cursors()
 
     def _split(self, error: np.ndarray, footprint: np.ndarray, share: float) -> Transfer | None:
         """Splits the leaves that this stage wants finer, among those that hold ``share`` of the error; None: there are none.
@@ -254,16 +250,16 @@ class OctreeTrainer:
         enough = 20_000 if not self.dataset.scene.is_unbounded else 80_000
         if self.bank is None or self.tiles_seen < self.config.prune_steps * self.config.tiles[self.stage]:
             return False
-        return self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
+        return self.tiles_seen >= min(self.config.coverage * len(self.bank.foreground_tiles), enough)
 
     def _prune_inside_stage(self, progress: float) -> None:
         """Prunes where it is due, and splits where that pays."""
         c = self.config
-        start = c.until[self.stage - 1] if self.stage else 0.0
+        start = c.stage_ends[self.stage - 1] if self.stage else 0.0
         due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
         if (
             self.prunings < c.prunes[self.stage]
-            and progress >= start + due * (c.until[self.stage] - start)
+            and progress >= start + due * (c.stage_ends[self.stage] - start)
             and self._seen_enough()
         ):
             error, footprint = self.state.error, self.state.footprint
@@ -280,7 +276,9 @@ class OctreeTrainer:
         rim of a few pictures would be lost for good. They cost no time, and are split no more.
         """
         needed = self.state.max_weight >= weight
-        if self.bank is not None and self.config.rich_share * self.tiles_seen < 2 * len(self.bank.rich_tiles):
+        if self.bank is not None and self.config.foreground_share * self.tiles_seen < 2 * len(
+            self.bank.foreground_tiles
+        ):
             needed |= self.state.footprint == 0
         return needed
 
@@ -296,7 +294,7 @@ class OctreeTrainer:
             raise InputError(
                 f"the octree collapsed to empty space at step {self.steps_done}: no training ray needs any of it; check "
                 "that --background is the images' background and that the scene bounds contain the object, or lower "
-                "octree.colour and octree.distortion"
+                "octree.colour_weight and octree.distortion"
             )
         error, footprint = self.state.error[keep], self.state.footprint[keep]
         self._change(*self.octree.prune(keep))
@@ -310,7 +308,7 @@ class OctreeTrainer:
         if self.bank is None or not self._seen_enough():
             return self.octree
         rng = np.random.default_rng(self.seed)
-        tiles = self.bank.rich_tiles if len(self.bank.rich_tiles) else self.bank.plain_tiles
+        tiles = self.bank.foreground_tiles if len(self.bank.foreground_tiles) else self.bank.background_tiles
         tiles = rng.choice(tiles, min(len(tiles), FINAL_TILES), replace=False)
         batch = self.bank.batch(tiles, np.ones(len(tiles), np.float32))
         needed = [self._needed(weight) for weight in self.config.final_prune_weights]

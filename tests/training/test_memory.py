@@ -87,8 +87,16 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
 def test_images_count(dataset):
     """Tiles by what a bank really holds; the files' pixels as long as they cannot be released for a larger octree."""
     bank = TileBank(dataset, (1.0, 1.0, 1.0), 1)
-    held = [*bank.pixels, bank.row, bank.image, bank.tile, bank.plain, bank.rich_tiles, bank.plain_tiles]
-    share = Beside(rich_share=len(bank.rich_tiles) / len(bank.row), held_out_bytes=77)
+    held = [
+        *bank.pixels,
+        bank.row,
+        bank.image,
+        bank.tile,
+        bank.is_background,
+        bank.foreground_tiles,
+        bank.background_tiles,
+    ]
+    share = Beside(foreground_share=len(bank.foreground_tiles) / len(bank.row), held_out_bytes=77)
     tiles = sum(array.nbytes for array in held)
     small, large = (estimate_training(dataset, leaves, 1, share).images for leaves in (0, 10**6))
     assert large - 77 == pytest.approx(tiles, rel=0.1)
