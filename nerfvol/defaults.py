@@ -11,4 +11,4 @@ DEFAULT_EARLY_STOP = 1 / 255
 
 
 DEFAULT_LOD = 0.8
-"""Pixels: a part of the octree that is smaller is drawn as one cell. More costs sharpness (docs/performance.md)."""
+"""Pixels: a part of the octree that is smaller is drawn as one cell. More costs sharpness (docs/experiments.md)."""

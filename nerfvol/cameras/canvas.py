@@ -80,6 +80,7 @@ def source_grid(canvas: Canvas, intrinsics: Intrinsics) -> tuple[NDArray[np.floa
     The widest spacing is taken at which positions between nodes, taken as linear, are within 0.01 pixels (by second
     differences), so that lenses are worked out at few places: a photo set may have one for every photograph.
     """
+    grid, step = np.empty((0, 0, 2)), 0
     for step in _STEPS:
         grid = _positions(canvas, intrinsics, step)
         inside = np.hypot(*(_plane(canvas.camera, grid.shape[:2], step).T)).T <= canvas.radius

@@ -7,6 +7,8 @@ it lies between.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,7 +79,7 @@ def _cubic_weights(t: Float) -> Float:
     return powers @ np.array(rows, np.float32)
 
 
-def _taps(picture: Float, x: Float, y: Float, cubic: bool) -> Float:
+def _taps(picture: Float, x: NDArray[Any], y: NDArray[Any], cubic: bool) -> Float:
     """The picture (h, w, k) at x, y (n,), counted from the first pixel's centre."""
     height, width = picture.shape[:2]
     i, j = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)

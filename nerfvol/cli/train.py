@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from nerfvol.cli.command import Command, assemble_options, need, set_threads
 from nerfvol.config.assemble import read_yaml
 from nerfvol.config.training import Config
+from nerfvol.datasets.formats import formats_help
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:
@@ -16,13 +17,15 @@ if TYPE_CHECKING:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--data", metavar="DIR", help="posed images: a folder with transforms*.json (Blender, instant-ngp "
-                   "or nerfstudio layout), LLFF poses or a COLMAP model, or the JSON file itself")  # fmt: skip
+    p.add_argument("--data", metavar="DIR", help=f"{formats_help()}; or a JSON file of transforms itself")
     p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
                    "previews/, checkpoint.safetensors")  # fmt: skip
     p.add_argument("--config", metavar="FILE", help="YAML file of settings, such as configs/smoke.yaml")
-    p.add_argument("--init", metavar="mlp|direct", help="start from a small MLP field that is trained first and then "
-                   "distilled, or straight from a low-density octree (default: direct)")  # fmt: skip
+    p.add_argument("--representation", metavar="auto|octree|splats", help="auto: splats on photographs, which they draw "
+                   "sharper and sooner; the octree, which has a density, on objects and media (default: auto)")  # fmt: skip
+    p.add_argument("--init", metavar="START", help="where it starts. octree: direct (low density everywhere) or mlp (a small "
+                   "field, trained first and distilled); splats: points (of a COLMAP model), sweep (of planes through the "
+                   "photographs), points+sweep, random, or a file of splats (default: auto)")  # fmt: skip
     p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "
                    "a fixed number of steps, the same result every time (default: none)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B from 0 to 1: what images with alpha "

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from nerfvol.config.splats import SplatConfig
@@ -283,6 +284,8 @@ PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_e
 
 
 OCTREE_STARTS = ("direct", "mlp")
+SPLAT_STARTS = ("points", "sweep", "points+sweep", "random")
+"""Besides a file of splats."""
 
 
 @dataclass
@@ -329,10 +332,21 @@ class Config(Checked):
     splats: SplatConfig = dataclasses.field(default_factory=SplatConfig)
     """Section: Gaussian splats and their optimisation (config.splats)."""
 
+    def check(self) -> None:
+        """Raises InputError where ``init`` is no start of the representation."""
+        known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS}
+        names = known.get(self.representation, OCTREE_STARTS + SPLAT_STARTS)
+        is_file = self.representation != "octree" and Path(self.init).exists()
+        if self.init != "auto" and self.init not in names and not is_file:
+            of = "" if self.representation == "auto" else f" for {self.representation}"
+            or_file = "" if self.representation == "octree" else " or a file of splats"
+            raise InputError(f"init: expected auto, {', '.join(names)}{or_file}{of}, got {self.init!r}")
+
     def for_scene(self, scene: SceneBounds) -> Config:
         """The same with a number for each setting that the kind of scene decides."""
         sections = {name: getattr(self, name).for_scene(scene) for name in ("octree", "distill", "splats")}
         chosen = self.representation
         if chosen == "auto":
-            chosen = "octree" if self.init in OCTREE_STARTS else "splats" if scene.is_unbounded else "octree"
+            named = "octree" if self.init in OCTREE_STARTS else "auto" if self.init == "auto" else "splats"
+            chosen = ("splats" if scene.is_unbounded else "octree") if named == "auto" else named
         return dataclasses.replace(self, **sections, representation=chosen)

@@ -13,7 +13,7 @@ the nearest such pixel, so that nothing begins empty.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from nerfvol.native import native
 from nerfvol.splats.neighbours import nearest
 from nerfvol.splats.points import PointCloud
 from nerfvol.starts import sweep_reference
+from nerfvol.starts.sweep_reference import SweepTask
 
 Float = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
@@ -114,19 +115,23 @@ def depth_maps(views: Sequence[SweepView], near: float, far: float) -> list[Dept
         maps[k, n] = _map(cameras[chosen[k]], cameras[others[k, n]])
     first, step = 1 / far, (1 / near - 1 / far) / (PLANES - 1)
     outputs = [[np.empty(greys[i].shape, np.float32) for i in chosen] for _ in range(3)]
-    work = (
+    apart = _apart(maps, others, step)
+    task = SweepTask(
         greys,
         masks,
         chosen.astype(np.int32),
         others.astype(np.int32),
         maps.astype(np.float32),
-        _apart(maps, others, step),
+        apart,
         PLANES,
         first,
         step,
     )
     compiled = native()
-    (compiled.plane_sweep if compiled is not None else sweep_reference.plane_sweep)(*work, *outputs)
+    if compiled is not None:
+        compiled.plane_sweep(*(getattr(task, field.name) for field in fields(task)), *outputs)
+    else:
+        sweep_reference.plane_sweep(task, *outputs)
     # A pixel whose rivals all lie beyond the other pictures' edges (-1) has not been compared with anything.
     sure = [
         (score > CONFIDENT) & (score - rival > CONTRAST) & (rival > -1)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,34 +14,50 @@ RADIUS = 3
 FLOOR = 4e-5
 
 
+@dataclass(frozen=True, eq=False)
+class SweepTask:
+    """What a sweep works on, in the order in which the kernel takes it.
+
+    ``greys``: (h, w) float32 in [0, 1]; ``masks``: (h, w) uint8 or None; ``picture`` (m,) int32: which are references;
+    ``others`` (m, k) int32: what each is compared with, -1 for nothing; ``maps`` (m, k, 12) float32: how (A and b);
+    ``apart`` (m,) int32: planes between the best and its rival; ``planes`` of them, inverse depths ``first`` + i ``step``.
+    """
+
+    greys: Sequence[Float]
+    masks: Sequence[NDArray[np.uint8] | None]
+    picture: NDArray[np.int32]
+    others: NDArray[np.int32]
+    maps: Float
+    apart: NDArray[np.int32]
+    planes: int
+    first: float
+    step: float
+
+
 def plane_sweep(
-    greys: Sequence[Float], masks: Sequence[NDArray[np.uint8] | None], picture: NDArray[np.int32],
-    others: NDArray[np.int32], maps: Float, apart: NDArray[np.int32], planes: int, first: float, step: float,
-    inverse_depth: Sequence[Float], score: Sequence[Float], rival: Sequence[Float],
-) -> None:  # fmt: skip
-    """Arguments and outputs are the kernel's: pictures, which are references, which others each is compared with and by
-    which maps (m, k, 12), how many planes a rival is away, the planes' inverse depths; written are three pictures a
-    reference."""
-    for r, p in enumerate(picture):
-        scores = np.full((planes, *greys[p].shape), -1.0)
-        compared = [k for k in range(others.shape[1]) if others[r, k] >= 0]
-        for plane in range(planes):
-            zncc = [_zncc(greys[p], *_seen(greys[j], masks[j], maps[r, k], first + step * plane, greys[p].shape))
-                    for k in compared for j in [others[r, k]]]  # fmt: skip
+    task: SweepTask, inverse_depth: Sequence[Float], score: Sequence[Float], rival: Sequence[Float]
+) -> None:
+    """Writes three pictures a reference, of its size: inverse depth, its score (-1: none) and the best rival's."""
+    for r, p in enumerate(task.picture):
+        grey, mask = task.greys[p], task.masks[p]
+        scores = np.full((task.planes, *grey.shape), -1.0)
+        compared = [(int(j), task.maps[r, k]) for k, j in enumerate(task.others[r]) if j >= 0]
+        for plane in range(task.planes):
+            w = task.first + task.step * plane
+            zncc = [_zncc(grey, *_seen(task.greys[j], task.masks[j], m, w, grey.shape)) for j, m in compared]
             if zncc:
                 best_two = np.sort(np.stack(zncc), axis=0)[-2:]
                 scores[plane] = np.where(best_two[0] > -1, best_two.mean(axis=0), -1.0)  # both must see the pixel
         best = scores.argmax(axis=0)
-        at = best + _shift(scores, best)
-        inverse_depth[r][:] = first + step * at
-        away = np.abs(np.arange(planes)[:, None, None] - best) >= apart[r]
+        away = np.abs(np.arange(task.planes)[:, None, None] - best) >= task.apart[r]
         rival[r][:] = np.where(away, scores, -1.0).max(axis=0)
+        inverse_depth[r][:] = task.first + task.step * (best + _shift(scores, best))
         top = np.take_along_axis(scores, best[None], 0)[0]
-        score[r][:] = top if masks[p] is None else np.where(masks[p] > 0, top, -1.0)
+        score[r][:] = top if mask is None else np.where(mask > 0, top, -1.0)
 
 
 def _seen(
-    grey: Float, mask: NDArray[np.uint8] | None, m: Float, w: float, shape: tuple[int, int]
+    grey: Float, mask: NDArray[np.uint8] | None, m: NDArray[Any], w: float, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The greys of a picture seen through plane w, and where they are on it."""
     y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
@@ -66,8 +84,8 @@ def _window_sums(a: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _zncc(a: Float, b: NDArray[np.float64], inside: NDArray[np.bool_]) -> NDArray[np.float64]:
-    a, b = a.astype(np.float64) - 0.5, b - 0.5
-    n, sa, sb, saa, sbb, sab = (_window_sums(x) for x in (np.ones_like(a), a, b, a * a, b * b, a * b))
+    d, b = a.astype(np.float64) - 0.5, b - 0.5
+    n, sa, sb, saa, sbb, sab = (_window_sums(x) for x in (np.ones_like(d), d, b, d * d, b * b, d * b))
     deviations = np.sqrt((np.maximum(saa - sa * sa / n, 0) + FLOOR) * (np.maximum(sbb - sb * sb / n, 0) + FLOOR))
     return np.where(inside, (sab - sa * sb / n) / deviations, -1.0)
 

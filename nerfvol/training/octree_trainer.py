@@ -1,6 +1,6 @@
 """Optimising the octree: stages from coarse to fine, pruning, subdivision where it pays.
 
-The recipe (docs/performance.md has what each choice is worth): images from small to full size, an octree that starts
+The recipe (docs/experiments.md has what each choice is worth): images from small to full size, an octree that starts
 thin and uniform, loses what no ray needs and splits what rays see at more than a pixel and holds most of the error;
 per-sample colour and distortion terms that empty space, smoothness that fades; RMSprop on touched vertices.
 """

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels.splat_state import SplatState
@@ -52,8 +50,6 @@ def _from_file(run: Run, path: str, degree: int) -> Splats:
     from nerfvol.models import load_model
     from nerfvol.views import SplatModel
 
-    if not Path(path).exists():
-        raise InputError(f"--init: splats start from {', '.join(STARTS)} or a file of splats, got {path!r}")
     model = load_model(path)
     if not isinstance(model, SplatModel):
         raise InputError(f"--init {path}: expected splats, it is a model of {model.kind}")

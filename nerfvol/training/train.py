@@ -20,9 +20,8 @@ from typing import Any
 from tqdm import tqdm
 
 from nerfvol import __version__
-from nerfvol.config.training import OCTREE_STARTS, Config
+from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
-from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
 from nerfvol.files.checkpoint import save_checkpoint
@@ -98,8 +97,6 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
 def begin_octree(run: Run) -> OctreeTrainer:
     """The trainer of an octree: from low density, or from a field that is trained first and distilled."""
     config, data = run.config, run.data
-    if config.init not in ("auto", *OCTREE_STARTS):
-        raise InputError(f"--init: an octree starts from {' or '.join(OCTREE_STARTS)}, got {config.init!r}")
     plan = OctreePlan(config, data.training, data.held_out_bytes)
     announce(run, plan.sentence())
     octree = start_from_field(run) if config.init == "mlp" and run.phase in ("start", "field") else None

@@ -76,7 +76,10 @@ def test_no_arguments_and_version(command):
         (["train", "--data", "nowhere", "--out", "x"], "--data nowhere: no such folder or file"),
         (["train", "--data", ".", "--out", "x", "--time-buget", "5s"], "did you mean --time-budget?"),
         (["train", "--data", ".", "--out", "x", "--time-budget", "soon"], "time_budget: expected a duration"),
-        (["train", "--data", ".", "--out", "x", "--init", "random"], "init: expected mlp or direct"),
+        (
+            ["train", "--data", ".", "--out", "x", "--init", "nothing"],
+            "init: expected auto, direct, mlp, points, sweep, points+sweep, random or a file of splats",
+        ),
         (["train", "--data", ".", "--out", "x", "--config", "none.yaml"], "no such file: none.yaml"),
         (["train", "--data", ".", "--out", "x", "--seed", "one"], "seed: expected a whole number, got 'one'"),
         (["train", "--data", ".", "--out", "x", "--set", "octree.stepz=3"], "did you mean 'octree.steps'?"),
