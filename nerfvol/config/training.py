@@ -94,7 +94,12 @@ class FieldConfig(Checked):
     """How a field is trained; the defaults are the best measured for a minute on two cores."""
 
     section: ClassVar[str] = "field"
-    former: ClassVar[Mapping[str, str]] = {"learning_rate": "rate", "final_learning_rate": "rate_decay"}
+    former: ClassVar[Mapping[str, str]] = {
+        "learning_rate": "rate",
+        "final_learning_rate": "rate_decay",
+        "max_rays": "a step has at most 8192 rays, and samples_per_step decides where they are fewer",
+        "near_fraction": "it is always 0.05",
+    }
 
     shape: FieldShape = dataclasses.field(default_factory=FieldShape)
     """Section: the network."""
@@ -108,8 +113,6 @@ class FieldConfig(Checked):
     """Share of progress at which each stage ends."""
     samples_per_step: Count = 16384
     """Samples of one step: the number of rays follows from how many samples a ray has just now."""
-    max_rays: Count = 8192
-    """Most rays of one step."""
     march_steps: tuple[Annotated[int, at_least(8)], ...] = (96, 192, 384)
     """Marching steps along the diagonal of the inner cube, one a stage."""
     sampler: Literal["occupancy", "importance"] = "occupancy"
@@ -120,8 +123,6 @@ class FieldConfig(Checked):
     """Inverse-CDF samples of a ray with the importance sampler."""
     grid_resolution: Annotated[int, at_least(8)] = 64
     """Cells along an edge of the occupancy grid, a multiple of 4."""
-    near_fraction: Share = 0.05
-    """Nearest sample to a camera, in units of half the inner cube's edge."""
     rate: Annotated[float, above(0, 1e3)] = 0.01
     """Adam's learning rate at the start."""
     rate_decay: Decay = 0.05
@@ -145,33 +146,33 @@ class DistillConfig(Checked):
     """How a field is made into an octree."""
 
     section: ClassVar[str] = "distill"
+    former: ClassVar[Mapping[str, str]] = {
+        "density_scale": "it is always 300, as in octrees that start from low density",
+        "samples_per_vertex": "it is always 8",
+        "visibility_downscale": "images are made so small that about 200 pixels are left along them, at most by 4",
+        "compare_downscale": "images are made so small that about 200 pixels are left along them, at most by 4",
+        "compare_views": "it is always 2",
+    }
 
     level: Level | None = None
     """Finest leaves: 2**level along an edge of the inner cube. None: 8, and 6 in photographs, whose fields are hazy."""
     coarse_level: Level = 5
     """Where the search begins; also the coarsest leaves that merging makes in the inner cube."""
-    sh_degree: Degree = 1
-    """Of the colours' spherical harmonics."""
-    density_scale: Annotated[float, above(0)] = 300.0
-    """Coefficient that a raw density of 1 means, per edge of the inner cube."""
+    sh_degree: Degree | None = None
+    """Spherical harmonics of the colours. None: as many as in the octree's section."""
     empty_opacity: Annotated[float, within(0, 0.999)] = 5e-4
     """A cell is empty where a finest leaf of its largest coefficient would be less opaque than this."""
     merge_tolerance: Weight = 0.01
     """Largest error, in opacity of a leaf and in its colour, that merging may cause; 0 keeps all leaves at one size."""
     prune_weight: Weight = 0.005
     """Leaves whose largest rendering weight over the training rays is below are removed; 0 keeps all."""
-    samples_per_vertex: Annotated[int, within(1, 8)] = 8
-    """Field samples averaged into a vertex: 1 (the vertex itself) or 8."""
     max_leaves: Count = 2_000_000
     """Most candidates; leaves are made coarser until they fit, then ``empty_opacity`` is raised."""
-    visibility_downscale: Count = 4
-    compare_downscale: Count = 4
-    compare_views: Count = 2
-    """Views, and their size, for the comparison of field and octree."""
 
     def for_scene(self, scene: SceneBounds) -> DistillConfig:
         """The same with a number for each None; photographs are scenes with background shells."""
-        return filled(self, {"level": 8 if not scene.is_unbounded else 6})
+        kind = BOUNDED if not scene.is_unbounded else PHOTOGRAPHS
+        return filled(self, {"level": 8 if not scene.is_unbounded else 6, "sh_degree": kind["sh_degree"]})
 
 
 @dataclass
@@ -186,6 +187,11 @@ class OctreeConfig(Checked):
         "smooth_density": "tv_density",
         "smooth_colour": "tv_sh",
         "smooth_from": "tv_from",
+        "coverage": "pruning always waits until half of the foreground tiles were seen",
+        "beta": "it is always 0.98",
+        "final_prune_weights": "they are always 0.04, 0.02 and 0.01, and final_prune_loss chooses among them",
+        "fine_from": "stages from level 9 on split leaves once",
+        "fine_steps": "a stage from level 9 on is always left out where fewer than 2500 steps would be left for it",
     }
 
     steps: Count = 15000
@@ -205,8 +211,6 @@ class OctreeConfig(Checked):
     """8x8 tiles in a batch, per stage: about equal work a step, so that shares of steps are shares of time."""
     prunes: list[Annotated[int, at_least(0)]] = dataclasses.field(default_factory=lambda: [3, 3, 2, 2, 2, 2, 2])
     """Prunings inside each stage, evenly spaced."""
-    coverage: Weight = 0.5
-    """Pruning waits until this share of the foreground tiles was seen (see _seen_enough for the cap)."""
     prune_steps: Annotated[int, at_least(0)] = 20
     """Steps before each pruning, at least: a low-density start needs some to become visible at all, however few the
     pictures."""
@@ -239,12 +243,8 @@ class OctreeConfig(Checked):
     """Rates shrink exponentially to this factor at the end. None: 0.04, and 0.02 in photographs."""
     decay_from: Annotated[float, within(0, 0.999)] | None = None
     """... from this share of progress on. None: 0.8, and 0.35 in photographs, whose noise takes longer to average."""
-    beta: Annotated[float, within(0, 0.9999)] = 0.98
-    """Memory, per step, of RMSprop's second moments."""
     prune_weight: Weight = 0.005
     """Leaves whose largest rendering weight since the last pruning is below are removed."""
-    final_prune_weights: list[Share] = dataclasses.field(default_factory=lambda: [0.04, 0.02, 0.01])
-    """At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
     final_prune_loss: Weight = 0.005
     """Share by which the squared error of training tiles may grow at the last pruning (0.005 is 0.02 dB); what it takes from
     the octree is speed and bytes that nobody sees, in thin shells about a tenth, in thick media nothing."""
@@ -253,8 +253,6 @@ class OctreeConfig(Checked):
     coarse_error: Share | None = None
     """... that are among the fewest to hold this share of the squared error. None: 0.9, and 0.5 in photographs, where much
     of what rays cross is haze that will be pruned."""
-    fine_from: Annotated[int, at_least(0)] = 9
-    """From this level on a stage splits leaves once, ..."""
     subdivide_pixels: Weight = 1.5
     """A stage from level 9 on splits leaves once: those larger than this many pixels ..."""
     subdivide_error: Share = 0.7
@@ -262,8 +260,6 @@ class OctreeConfig(Checked):
     growing_error: Share | None = None
     """Each pruning inside a stage splits leaves too, once, by this share of the squared error. None: 0 (none), and 0.5 in
     photographs."""
-    fine_steps: Annotated[int, at_least(0)] = 2500
-    """A stage from level ``fine_from`` on is left out where fewer steps would be left for it."""
     early_stop_eps: Annotated[float, within(0, 0.999)] = 4e-3
     """Training rays end when their transmittance falls below."""
 
@@ -310,7 +306,7 @@ class Config(Checked):
     downscale: Count = 1
     """Images are area-averaged by this whole factor."""
     aabb: Annotated[tuple[float, float, float, float, float, float] | None, box] = None
-    """The inner cube, lowest and highest corner in the units of the poses; None: worked out from the cameras."""
+    """The region of detail, lowest and highest corner in the units of the poses; None: worked out from the cameras."""
     threads: Annotated[int, at_least(0)] = 0
     """CPU threads; 0: all cores this process may use."""
     seed: int = 0
@@ -344,7 +340,9 @@ class Config(Checked):
 
     def for_scene(self, scene: SceneBounds) -> Config:
         """The same with a number for each setting that the kind of scene decides."""
-        sections = {name: getattr(self, name).for_scene(scene) for name in ("octree", "distill", "splats")}
+        octree = self.octree.for_scene(scene)
+        distill = filled(self.distill, {"sh_degree": octree.sh_degree}).for_scene(scene)
+        sections = {"octree": octree, "distill": distill, "splats": self.splats.for_scene(scene)}
         chosen = self.representation
         if chosen == "auto":
             named = "octree" if self.init in OCTREE_STARTS else "auto" if self.init == "auto" else "splats"

@@ -17,6 +17,11 @@ BLOCKS = {0: 1, 1: 1, 2: 2, 3: 4}
 DENSITY_SLOT = 12
 
 
+DENSITY_SCALE = 300.0
+"""Coefficient that a raw density of 1 means where training begins, per edge of the inner cube: leaves of 1/300 of it are then
+opaque to 63 %."""
+
+
 def explin(raw: np.ndarray) -> np.ndarray:
     """exp(raw - 1) below 1, raw above: positive, with a bounded slope [SVRaster]. Any shape."""
     return np.where(raw < 1, np.exp(np.minimum(raw, 1) - 1), raw)

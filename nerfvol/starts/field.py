@@ -30,11 +30,17 @@ from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
 from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.octree.merge import merge_smooth
-from nerfvol.octree.rows import EMPTY_DENSITY, explin_inverse
+from nerfvol.octree.rows import DENSITY_SCALE, EMPTY_DENSITY, explin_inverse
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
 from nerfvol.views import OctreeModel
 
+COMPARED_VIEWS = 2
+"""Training views on which field and octree are compared."""
+JUDGED_PIXELS = 200
+"""Along the longer side of an image: what visibility and comparison need is seen in so many; ..."""
+JUDGED_DOWNSCALE = 4
+"""... but larger images are averaged by no more than this, lest what is thin goes unseen."""
 _CHUNK = 32768  # points of one evaluation of the field
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
 
@@ -96,15 +102,15 @@ def distill(
     level, ijk = level[kept], ijk[kept]
     return_free_memory()
     octree = Octree.from_leaves(
-        level, ijk, frame.origin.tolist(), frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
+        level, ijk, frame.origin.tolist(), frame.size, cast(int, config.sh_degree), DENSITY_SCALE / (2 * domain.half)
     )
-    write_values(octree, field, config.samples_per_vertex)
+    write_values(octree, field)
     candidates = octree.n_leaves
     octree = merge_smooth(octree, config.coarse_level, config.merge_tolerance)
     merged = octree.n_leaves
     return_free_memory()
     if config.prune_weight > 0:
-        weights = largest_weights(octree, dataset, background, config.visibility_downscale)
+        weights = largest_weights(octree, dataset, background, judged_downscale(dataset))
         keep = weights >= config.prune_weight
         if not keep.any():
             raise InputError(
@@ -114,7 +120,7 @@ def distill(
     return_free_memory()
     field_psnr = octree_psnr = math.nan
     if render_field is not None:
-        few = dataset.evenly(config.compare_views).smaller(config.compare_downscale, background)
+        few = dataset.evenly(COMPARED_VIEWS).smaller(judged_downscale(dataset), background)
         field_psnr = score_views(render_field, few, background)["psnr"]
         octree_psnr = evaluate(OctreeModel(octree), few, background)["psnr"]
     levels, counts = np.unique(octree.leaf_level, return_counts=True)
@@ -125,6 +131,12 @@ def distill(
         pruned=merged - octree.n_leaves, field_psnr=field_psnr, octree_psnr=octree_psnr, messages=messages,
     )  # fmt: skip
     return octree, report
+
+
+def judged_downscale(dataset: Dataset) -> int:
+    """The factor by which images are averaged before leaves are judged by them: about JUDGED_PIXELS are left."""
+    longest = max(max(c.intrinsics.width, c.intrinsics.height) for c in dataset.cameras)
+    return min(JUDGED_DOWNSCALE, max(1, longest // JUDGED_PIXELS))
 
 
 @dataclasses.dataclass(frozen=True)

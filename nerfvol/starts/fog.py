@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.octree.rows import DENSITY_SCALE
 from nerfvol.octree.tree import Octree
 
 
@@ -29,4 +30,4 @@ def low_density_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
     levels, cells = np.concatenate(levels), np.concatenate(cells)
     kept = ~dataset.before_a_lens(origin + (cells + 0.5) * (size / 2.0**levels)[:, None])
     levels, cells = levels[kept], cells[kept]
-    return Octree.from_leaves(levels, cells, origin, size, sh_degree, density_scale=300 / detail)
+    return Octree.from_leaves(levels, cells, origin, size, sh_degree, density_scale=DENSITY_SCALE / detail)

@@ -38,6 +38,18 @@ SECONDS_TO_WRITE = 0.5
 SECONDS_TO_WRITE_A_LEAF = 1.5e-6
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
+COVERAGE = 0.5
+"""Share of the foreground tiles that were seen before leaves are pruned, ..."""
+ENOUGH_TILES, ENOUGH_TILES_OF_PHOTOGRAPHS = 20_000, 80_000
+"""... and so many at most: around photographs much is seen at the rim of a few of them only, which takes more tiles to meet."""
+FINE_LEVEL = 9
+"""From this level on a stage splits leaves once, and ..."""
+FINE_STEPS = 2500
+"""... is left out where fewer steps would be left for it."""
+BETA = 0.98
+"""Memory, per step, of RMSprop's second moments."""
+FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
+"""At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
 FINAL_TILES = 4096
 """Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
 
@@ -182,7 +194,7 @@ class OctreeTrainer:
         )
         late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
         rate = c.rate_decay**late
-        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=c.beta)
+        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=BETA)
         batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
         self.steps_done += 1
@@ -208,7 +220,7 @@ class OctreeTrainer:
         old, self.stage, self.prunings = self.stage, self.stage + 1, 0
         error, footprint = self.prune()
         footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
-        fine = c.levels[self.stage] >= c.fine_from
+        fine = c.levels[self.stage] >= FINE_LEVEL
         for _ in range(1 if fine else c.levels[self.stage]):
             transfer = self._split(error, footprint, c.subdivide_error if fine else c.coarse_error)
             if transfer is None:
@@ -226,7 +238,7 @@ class OctreeTrainer:
         error, footprint (in pixels of this stage's images): (n_leaves,).
         """
         c, level = self.config, self.config.levels[self.stage]
-        split = footprint > (c.subdivide_pixels if level >= c.fine_from else c.whole_pixels)
+        split = footprint > (c.subdivide_pixels if level >= FINE_LEVEL else c.whole_pixels)
         split &= self.octree.leaf_level < self.dataset.scene.finest_levels(self.octree.leaf_centers(), level)
         split &= holds_share(error, share)
         split = splits_within(split, error, self.max_leaves)
@@ -242,15 +254,14 @@ class OctreeTrainer:
         """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
         c, stage = self.config, self.stage + 1
         left = self.steps_done * (1 - progress) / max(progress - self._start, 1e-9)
-        return left >= (c.fine_steps if c.levels[stage] >= c.fine_from else c.prunes[stage] * c.prune_steps)
+        return left >= (FINE_STEPS if c.levels[stage] >= FINE_LEVEL else c.prunes[stage] * c.prune_steps)
 
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
-        # Around photographs much is seen at the rim of a few of them only: it takes more tiles to have met it at all.
-        enough = 20_000 if not self.dataset.scene.is_unbounded else 80_000
+        enough = ENOUGH_TILES_OF_PHOTOGRAPHS if self.dataset.scene.is_unbounded else ENOUGH_TILES
         if self.bank is None or self.tiles_seen < self.config.prune_steps * self.config.tiles[self.stage]:
             return False
-        return self.tiles_seen >= min(self.config.coverage * len(self.bank.foreground_tiles), enough)
+        return self.tiles_seen >= min(COVERAGE * len(self.bank.foreground_tiles), enough)
 
     def _prune_inside_stage(self, progress: float) -> None:
         """Prunes where it is due, and splits where that pays."""
@@ -301,7 +312,7 @@ class OctreeTrainer:
         return error, footprint
 
     def finish(self) -> Octree:
-        """The octree without the leaves that no picture misses: see ``final_prune_weights``. Ends the training.
+        """The octree without the leaves that no picture misses: see FINAL_PRUNE_WEIGHTS. Ends the training.
 
         A second octree stands beside the first while they are compared; moments and tiles are let go before.
         """
@@ -311,7 +322,7 @@ class OctreeTrainer:
         tiles = self.bank.foreground_tiles if len(self.bank.foreground_tiles) else self.bank.background_tiles
         tiles = rng.choice(tiles, min(len(tiles), FINAL_TILES), replace=False)
         batch = self.bank.batch(tiles, np.ones(len(tiles), np.float32))
-        needed = [self._needed(weight) for weight in self.config.final_prune_weights]
+        needed = [self._needed(weight) for weight in FINAL_PRUNE_WEIGHTS]
         self.bank = None
         del self.state, tiles
         return_free_memory()

@@ -27,6 +27,7 @@ from nerfvol.config.values import (
     within,
 )
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 
 
 @dataclass(frozen=True)
@@ -280,3 +281,12 @@ def test_every_setting_is_explained(cls):
     for setting, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(setting, ast.AnnAssign) and "ClassVar" not in ast.unparse(setting.annotation):
             assert isinstance(after, ast.Expr) and isinstance(after.value.value, str), setting.target.id
+
+
+@pytest.mark.parametrize(
+    "octree, distill, degree", [({}, {}, 1), ({"sh_degree": 2}, {}, 2), ({"sh_degree": 2}, {"sh_degree": 0}, 0)]
+)
+def test_a_distilled_octree_has_the_bands_of_the_octree_section(octree, distill, degree):
+    """Unless its own says otherwise."""
+    config = assemble(Config, ({"octree": octree, "distill": distill}, "a.yaml"))
+    assert config.for_scene(SceneBounds([[-1] * 3, [1] * 3], None, True)).distill.sh_degree == degree

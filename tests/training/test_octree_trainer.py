@@ -9,11 +9,11 @@ import pytest
 from nerfvol.config.training import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.load import load_dataset
-from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.octree.rows import DENSITY_SLOT
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
+from nerfvol.training import octree_trainer
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.views import render_image
 
@@ -172,9 +172,8 @@ def test_a_run_has_the_settings_of_its_scene(tiny_scene):
 @pytest.mark.parametrize("progress, begins", [(0.5, False), (0.3, True)])
 def test_a_coarse_stage_needs_steps_for_its_prunings(tiny_scene, monkeypatch, progress, begins):
     """Two prunings take 40 steps: 30 in half of a run leave 30, in three tenths 70."""
-    config = OctreeConfig(
-        levels=[3, 4], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 2], coverage=0
-    )
+    monkeypatch.setattr(octree_trainer, "COVERAGE", 0)
+    config = OctreeConfig(levels=[3, 4], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 2])
     steps_taken(monkeypatch)
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
     for _ in range(30):
@@ -251,10 +250,11 @@ def test_a_coarse_stage_splits_what_holds_the_error(tiny_scene):
 
 
 @pytest.mark.parametrize("share, leaves", [(0.0, 512), (0.99, 512 + 6 * 7)])
-def test_a_stage_grows_where_the_error_is(tiny_scene, share, leaves):
+def test_a_stage_grows_where_the_error_is(tiny_scene, monkeypatch, share, leaves):
     """At its prunings, also where there is nothing to prune, once each time and where asked for; and then looks anew."""
+    monkeypatch.setattr(octree_trainer, "COVERAGE", 0)
     config = OctreeConfig(
-        levels=[3, 5], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 1], prune_steps=1, coverage=0,
+        levels=[3, 5], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 1], prune_steps=1,
         coarse_error=0.0, growing_error=share,
     )  # fmt: skip
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)

@@ -149,7 +149,7 @@ def test_lego_small(tmp_path, init, command):
         "octree": {**TINY["octree"], "steps": 150, "levels": [5, 6, 7], "tiles": [64, 128, 128]},
         "field": {"steps": 40, "downscales": [2, 1], "stage_ends": [0.5, 1.0], "march_steps": [64, 96],
                   "samples_per_step": 8192},
-        "distill": {"level": 6, "coarse_level": 4, "compare_views": 1, "visibility_downscale": 2},
+        "distill": {"level": 6, "coarse_level": 4},
         "compare_views": 1, "threads": 1,
     }  # fmt: skip
     (tmp_path / "plan.yaml").write_text(json.dumps(plan))
