@@ -1,4 +1,4 @@
-"""07  A data set in a format of your own, poses.csv (name, eye, target) beside pictures; then training, step by step.
+"""07  A data set in a format of your own, poses.csv (name, eye, target) next to pictures; then training, step by step.
 
 A reader ends with cameras, uint8 images, names, and the region that the scene fills. docs/extending.md makes it a format.
 """

@@ -127,7 +127,7 @@ def _tiled(image: np.ndarray) -> np.ndarray:
 
 
 def _sort_out(tiles: np.ndarray, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (1 + foreground tiles, 64, 3), a background tile first, and which of them each of ``tiles`` (n, 64, 3) has (n,)."""
+    """Pixels (1 + foreground tiles, 64, 3), a background tile first; and which of these each of ``tiles`` (n, 64, 3) is."""
     background_tile = np.tile(np.round(np.asarray(background) * 255).astype(np.uint8), (1, TILE_RAYS, 1))
     foreground = (tiles != background_tile).any((1, 2))
     pixels = np.concatenate([background_tile, tiles[foreground]])

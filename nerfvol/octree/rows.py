@@ -33,7 +33,7 @@ def explin_inverse(value: np.ndarray) -> np.ndarray:
 
 
 def sh_slots(degree: int) -> np.ndarray:
-    """Where coefficient k of channel c stands in a vertex row: (3, (degree + 1)**2) int. Density stands at slot 12.
+    """Where coefficient k of channel c is stored in a vertex row: (3, (degree + 1)**2) int. Density is at slot 12.
 
     Rows are blocks of 16: four coefficients of red, four of green, four of blue, four spare places (the first block's
     hold the density, the second's the ninth coefficients of degree 2).
@@ -55,8 +55,11 @@ def convert_rows(rows: np.ndarray, old_degree: int, new_degree: int) -> np.ndarr
 
 
 @dataclass(frozen=True)
-class Averages:
-    """corners: (n_nodes, 8) int32, rows of ``values`` (n, row) float32, packed like those of the octree's vertices."""
+class PrefilteredNodes:
+    """What interior nodes are drawn with: corners (n_nodes, 8) int32, rows of values (n, row) float32.
+
+    The rows are packed like those of the octree's vertices.
+    """
 
     corners: np.ndarray
     values: np.ndarray

@@ -1,8 +1,8 @@
 """Distillation: a radiance field becomes a sparse octree of several leaf sizes, and what that costs is measured.
 
 1. Candidates: the field is looked at in coarse cells; only cells that hold something, and their neighbours, are looked
-   at again at half the size, down to the finest level (outside the region of detail: the coarser the farther out).
-2. Values: coefficient and spherical harmonics at the leaves' vertices, averaged over the vertex's surroundings.
+   at again at half the size, down to the finest level (outside the inner cube: the coarser the farther out).
+2. Values: coefficient and spherical harmonics at the leaves' vertices, averaged around the vertex.
 3. Merging: eight leaves whose values the parent's own corners reproduce become one. Done before pruning, so that thin
    haze is judged by large leaves, in which it has weight.
 4. Visibility: the training rays are rendered, and leaves no ray needs are removed [PlenOctrees, section 4].
@@ -143,7 +143,7 @@ def judged_downscale(dataset: Dataset) -> int:
 class Frame:
     """The octree's root cube, and how fine it is where.
 
-    origin (3,), size: the root cube. finest: the level of leaves in the detail cube. center, half: the detail cube.
+    origin (3,), size: the root cube. finest: the level of leaves in the inner cube. center, half: the inner cube.
     """
 
     origin: np.ndarray
@@ -154,7 +154,7 @@ class Frame:
 
     @classmethod
     def of(cls, domain: Domain, level: int) -> Frame:
-        """The detail cube itself, or the smallest power-of-two multiple of it that holds the background."""
+        """The inner cube itself, or the smallest power-of-two multiple of it that holds the background."""
         doublings = max(0, math.ceil(math.log2(domain.outer) - 1e-6))
         center, size = np.array(domain.center), 2 * domain.half * 2.0**doublings
         return cls(center - size / 2, size, level + doublings, center, domain.half)
@@ -164,7 +164,7 @@ class Frame:
         edge = self.size / 2**level
         low = self.origin + ijk * edge - self.center
         nearest = np.maximum(np.maximum(low, -(low + edge)), 0).max(1)  # Chebyshev distance of the cell's nearest point
-        # Shell k holds distances from 2**(k - 1) to 2**k; the detail cube itself is 0.
+        # Shell k holds distances from 2**(k - 1) to 2**k; the inner cube itself is 0.
         shells = np.where(
             nearest < self.half * (1 - 1e-9), 0, np.floor(np.log2(np.maximum(nearest / self.half, 1)) + 1e-9) + 1
         )
@@ -196,7 +196,7 @@ def candidate_cells(
             threshold *= 2
     if level < cast(int, config.level):
         messages.append(
-            f"the field is hazy: with leaves smaller than 1/{1 << level} of the region of detail it would not fit into "
+            f"the field is hazy: with leaves smaller than 1/{1 << level} of the inner cube it would not fit into "
             f"{config.max_leaves:,} leaves"
         )
     if threshold > -math.log1p(-config.empty_opacity):

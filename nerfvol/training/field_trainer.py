@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def domain_of(scene: SceneBounds) -> Domain:
-    """The cube of detail around the scene's bounds, and the background cube around it where there is one."""
+    """The inner cube around the scene's bounds, and the background cube around it where there is one."""
     aabb = np.asarray(scene.aabb, dtype=np.float64)
     center, half = aabb.mean(0), float((aabb[1] - aabb[0]).max() / 2)
     if not (math.isfinite(half) and half > 0):

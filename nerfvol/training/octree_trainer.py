@@ -1,8 +1,8 @@
 """Optimising the octree: stages from coarse to fine, pruning, subdivision where it pays.
 
 The recipe (docs/experiments.md has what each choice is worth): images from small to full size, an octree that starts
-thin and uniform, loses what no ray needs and splits what rays see at more than a pixel and holds most of the error;
-per-sample colour and distortion terms that empty space, smoothness that fades; RMSprop on touched vertices.
+nearly transparent and uniform, loses what no ray needs and splits what rays see at more than a pixel and holds most of
+the error; per-sample colour and distortion terms that empty space, total variation that fades; RMSprop on touched vertices.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from nerfvol.starts.fog import low_density_octree
 from nerfvol.training.memory import OctreePlan, splits_within
 from nerfvol.views import OctreeModel, render_image
 
-BEHIND = 2
-"""Stream of random numbers of the colours behind photographs; TileBank has 0 and 1."""
+BACKGROUND_STREAM = 2
+"""Stream of random numbers of the random background of photographs; TileBank has 0 and 1."""
 FEWEST_STEPS = 5000
 """Before a run with a time budget may end early, however few its tiles."""
 SECONDS_TO_WRITE = 0.5
-"""... and read an octree, beside ..."""
+"""... and read an octree, plus ..."""
 SECONDS_TO_WRITE_A_LEAF = 1.5e-6
 WORTH_PRUNING = 0.05
-"""Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
+"""Share of the leaves below which a pruning inside a stage is left out: two octrees are in memory while one is made."""
 COVERAGE = 0.5
 """Share of the foreground tiles that were seen before leaves are pruned, ..."""
 ENOUGH_TILES, ENOUGH_TILES_OF_PHOTOGRAPHS = 20_000, 80_000
@@ -169,7 +169,7 @@ class OctreeTrainer:
         for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
         self.cursors = Cursors.of(state["cursors"])
-        # The bank says when enough was seen to prune: where it stood before, it must stand at once.
+        # The bank says when enough was seen to prune: where there was one, there must be one at once.
         self.bank = None if self.steps_done == 0 else self._make_bank()
 
     def step(self, progress: float) -> ops.StepReport:
@@ -185,7 +185,7 @@ class OctreeTrainer:
         fade = c.regulariser_decay**progress
         smooth = fade if self.steps_done >= c.tv_from else 0.0
         options = ops.LossOptions(
-            background=self._behind(),
+            background=self._random_background(),
             colour=c.colour_weight * fade,
             distortion=c.distortion * fade,
             tv_density=c.tv_density * smooth,
@@ -201,14 +201,16 @@ class OctreeTrainer:
         self.tiles_seen += c.tiles[self.stage]
         return report
 
-    def _behind(self) -> tuple[float, ...]:
-        """What this step's rays see where they leave the octree: the background.
+    def _random_background(self) -> tuple[float, ...]:
+        """What this step's rays see where they leave the octree: the background of objects.
 
         In photographs another colour each step, for they have none, and nothing in them may rely on one.
         """
         if not self.dataset.scene.is_unbounded:
             return self.background
-        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, BEHIND, self.steps_done])))
+        random = np.random.Generator(
+            np.random.Philox(np.random.SeedSequence([self.seed, BACKGROUND_STREAM, self.steps_done]))
+        )
         return tuple(random.random(3).tolist())
 
     def _make_bank(self) -> TileBank:
@@ -277,13 +279,13 @@ class OctreeTrainer:
             if 1 - self._needed(c.prune_weight).mean() >= WORTH_PRUNING:
                 error, footprint = self.prune()
             if not c.growing_error or self._split(error, footprint, c.growing_error) is None:
-                self._start_anew()
+                self._forget_statistics()
             self.prunings += 1
 
     def _needed(self, weight: float) -> np.ndarray:
         """Which leaves have a largest weight of at least ``weight``, (n_leaves,).
 
-        And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what stands at the
+        And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what is seen at the
         rim of a few pictures would be lost for good. They cost no time, and are split no more.
         """
         needed = self.state.max_weight >= weight
@@ -293,7 +295,7 @@ class OctreeTrainer:
             needed |= self.state.footprint == 0
         return needed
 
-    def _start_anew(self) -> None:
+    def _forget_statistics(self) -> None:
         """Forgets what rays needed so far."""
         self.tiles_seen = 0
         self.state.reset_statistics(self.octree.n_leaves)
@@ -314,7 +316,7 @@ class OctreeTrainer:
     def finish(self) -> Octree:
         """The octree without the leaves that no picture misses: see FINAL_PRUNE_WEIGHTS. Ends the training.
 
-        A second octree stands beside the first while they are compared; moments and tiles are let go before.
+        A second octree is in memory while they are compared; moments and tiles are released before.
         """
         if self.bank is None or not self._seen_enough():
             return self.octree

@@ -130,7 +130,7 @@ def announce(run: Run, memory: str) -> None:
 
 # ------------------------------------------------------------------ the loop
 def optimise(run: Run, phase: Phase) -> None:
-    """Steps until the phase is over, with all that goes on beside them."""
+    """Steps until the phase is over, with all that goes on around them."""
     run.enter(phase)
     progress = run.progress(phase)
     with progress_bar(phase.name, progress) as bar:

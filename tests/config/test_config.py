@@ -276,7 +276,7 @@ def test_old_names_lead_to_present_ones(cls):
 
 @pytest.mark.parametrize("cls", (*SECTIONS, Config))
 def test_every_setting_is_explained(cls):
-    """One docstring each, below it: it is all the reference there is beside config.yaml."""
+    """One docstring each, below it: it is all the reference there is besides config.yaml."""
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
     for setting, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(setting, ast.AnnAssign) and "ClassVar" not in ast.unparse(setting.annotation):

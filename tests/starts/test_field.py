@@ -262,7 +262,7 @@ def test_dilation_is_one_cell() -> None:
 
 
 def test_leaves_grow_outside_the_detail() -> None:
-    """With a background: full level inside the detail cube, one level less at each doubling of the distance."""
+    """With a background: full level inside the inner cube, one level less at each doubling of the distance."""
 
     class Everywhere(Blob):
         def density(self, positions: torch.Tensor) -> torch.Tensor:
@@ -405,6 +405,10 @@ def test_leaves_are_judged_by_images_of_some_size(side, factor):
     """Small images as they are; of large ones about 200 pixels, and never less than a quarter of what there is."""
     lens = Intrinsics(side, side // 2 or 1, side, side, side / 2, side / 4)
     dataset = Dataset(
-        orbit(1, (0, 0, 0), 3, 10, lens), [], ["a"], SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, True), "test"
+        orbit(1, center=(0, 0, 0), radius=3, elevation_deg=10, intrinsics=lens),
+        [],
+        ["a"],
+        SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, True),
+        "test",
     )
     assert judged_downscale(dataset) == factor

@@ -19,7 +19,7 @@ from nerfvol.views import render_image
 
 
 def test_nothing_is_pruned_before_it_could_become_visible(tiny_scene):
-    """A thin start needs steps: however few the tiles and however short the stage, pruning waits for them."""
+    """A low-density start needs steps: however few the tiles and however short the stage, pruning waits for them."""
     config = OctreeConfig(
         levels=[4, 5], downscales=[4, 2], stage_ends=[0.001, 1.0], tiles=[4, 4], prunes=[1, 1], prune_steps=12
     )
@@ -74,8 +74,8 @@ def test_the_last_pruning_leaves_what_pictures_miss(tiny_scene):
     assert tuner.finish() is tuner.octree
 
 
-def test_the_last_pruning_stands_beside_nothing_else(tiny_scene, monkeypatch):
-    """Two octrees are in memory while they are compared: moments, statistics and tiles are let go before."""
+def test_the_last_pruning_has_the_memory_to_itself(tiny_scene, monkeypatch):
+    """Two octrees are in memory while they are compared: moments, statistics and tiles are released before."""
     tuner, _ = finished_trainer(tiny_scene, 0.03)
     held = [weakref.ref(part) for part in (tuner.state, tuner.state.moments, tuner.bank, tuner.bank.pixels[0])]
     alive = []
@@ -144,7 +144,7 @@ def test_settings_that_mean_nothing_are_refused(tiny_scene, tmp_path, command, s
 
 
 def test_photographs_have_settings_of_their_own(tiny_scene):
-    """Where nothing else is said; a scene with surroundings is one of photographs."""
+    """Where nothing else is said; a scene with background shells is one of photographs."""
     objects, photographs = (dataset.scene for dataset in of_both_kinds(tiny_scene))
     automatic = [f.name for f in dataclasses.fields(OctreeConfig) if f.default is None]
     chosen = [dataclasses.asdict(OctreeConfig().for_scene(scene)) for scene in (objects, photographs)]
@@ -156,7 +156,7 @@ def test_photographs_have_settings_of_their_own(tiny_scene):
 
 
 def of_both_kinds(tiny_scene) -> list[Dataset]:
-    """The scene as an object and, with surroundings, as one of photographs."""
+    """The scene as an object and, with background shells, as one of photographs."""
     dataset = load_dataset(tiny_scene, "train")
     around = dataclasses.replace(dataset.scene, background_cube=8 * dataset.scene.aabb)
     return [dataset, dataclasses.replace(dataset, scene=around)]
@@ -251,7 +251,7 @@ def test_a_coarse_stage_splits_what_holds_the_error(tiny_scene):
 
 @pytest.mark.parametrize("share, leaves", [(0.0, 512), (0.99, 512 + 6 * 7)])
 def test_a_stage_grows_where_the_error_is(tiny_scene, monkeypatch, share, leaves):
-    """At its prunings, also where there is nothing to prune, once each time and where asked for; and then looks anew."""
+    """At its prunings, also where there is nothing to prune, once each time and where asked for; and then looks again."""
     monkeypatch.setattr(octree_trainer, "COVERAGE", 0)
     config = OctreeConfig(
         levels=[3, 5], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 1], prune_steps=1,
@@ -267,7 +267,7 @@ def test_a_stage_grows_where_the_error_is(tiny_scene, monkeypatch, share, leaves
 
 @pytest.mark.parametrize("share, prunes", [(0.04, False), (0.06, True)])
 def test_a_pruning_that_takes_little_is_left_out(tiny_scene, share, prunes):
-    """Two octrees would stand in memory for nothing; what rays need is noted anew all the same."""
+    """Two octrees would be in memory for nothing; what rays need is noted again all the same."""
     config = OctreeConfig(levels=[4], downscales=[2], stage_ends=[1.0], tiles=[16], prunes=[1], prune_steps=8)
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
     for _ in range(30):
@@ -281,7 +281,7 @@ def test_a_pruning_that_takes_little_is_left_out(tiny_scene, share, prunes):
 
 
 def test_what_no_ray_has_met_yet_is_kept(tiny_scene):
-    """Until every tile was drawn for certain: what stands at the rim of a few pictures would be lost for good."""
+    """Until every tile was drawn for certain: what is seen at the rim of a few pictures would be lost for good."""
     config = OctreeConfig(levels=[4], downscales=[2], stage_ends=[1.0], tiles=[16], prunes=[1], prune_steps=8)
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
     for _ in range(10):

@@ -1,4 +1,4 @@
-"""The training run: memory let go on the way, errors, what cannot be used, a real scene."""
+"""The training run: memory released on the way, errors, what cannot be used, a real scene."""
 
 import dataclasses
 import gc
@@ -24,7 +24,7 @@ from tests.fixtures.tiny import write_scene
 @pytest.mark.parametrize("downscales, checkpoint_every, last", [
     ([2, 1, 1], 1000, 1), ([2, 1, 1], 1e-9, 1), ([1, 1, 1], 1e-9, 0)
 ])  # fmt: skip
-def test_the_pictures_are_let_go_once_they_are_in_tiles(
+def test_the_pictures_are_released_once_they_are_in_tiles(
     tmp_path, tiny_scene, monkeypatch, downscales, checkpoint_every, last
 ):
     """From the second step of the stage whose tiles serve to the end; ``last``: the first stage of the last resolution."""
