@@ -16,7 +16,7 @@ from nerfvol.region import SceneBounds
 from nerfvol.training.octree_trainer import OctreeTrainer
 
 
-def read(folder: Path, focal: float, box) -> nerfvol.Dataset:
+def read(folder: Path, focal: float, box: np.ndarray) -> nerfvol.Dataset:
     rows = [(name, np.array(numbers, float)) for name, *numbers in csv.reader((folder / "poses.csv").open())]
     images = [np.asarray(Image.open(folder / name)) for name, _ in rows]
     lens = nerfvol.Intrinsics(64, 64, focal, focal, cx=32.0, cy=32.0)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,22 +56,45 @@ def through_lens(render_pinhole: Callable[[Camera], Pictures], camera: Camera) -
     lens = camera.intrinsics
     if is_pinhole(lens):
         return {name: np.asarray(a, np.float32) for name, a in render_pinhole(camera).items()}
-    directions = lens.directions().reshape(-1, 3)
     out: dict[str, Float] = {}
+    for face in _plan(lens):
+        pose = camera.c2w.copy()
+        pose[:3, :3] = pose[:3, :3] @ face.rotation
+        for name, drawn in render_pinhole(Camera(face.pinhole, pose)).items():
+            picture = np.asarray(drawn, np.float32)
+            shape = (lens.height * lens.width, *picture.shape[2:])
+            values = _resampled(name, picture.reshape(*picture.shape[:2], -1), face.places).reshape(-1, *shape[1:])
+            if isinstance(face.chosen, slice):
+                out[name] = values
+            else:
+                out.setdefault(name, np.zeros(shape, np.float32))[face.chosen] = values
+    return {name: a.reshape(lens.height, lens.width, *a.shape[1:]) for name, a in out.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """A pinhole that sees a part of what a lens sees: ``rotation`` (3, 3) to the camera's axes; ``chosen``: which pixels of the
+    lens it draws; ``places`` (n, 2) float32: where they are in its picture."""
+
+    rotation: NDArray[np.float64]
+    chosen: NDArray[np.bool_] | slice
+    pinhole: Intrinsics
+    places: Float
+
+
+@functools.lru_cache(maxsize=4)
+def _plan(lens: Intrinsics) -> tuple[_Face, ...]:
+    """The pinholes that together see what ``lens`` sees; kept, for the pictures of a path and of a data set share a lens."""
+    directions = lens.directions().reshape(-1, 3)
+    faces = []
     for rotation, chosen in _faces(directions):
         local = directions[chosen] @ rotation.astype(np.float32)
         plane = local[:, :2] / -local[:, 2:] * (lens.fx, -lens.fy)
         first = np.floor(plane.min(axis=0)) - _MARGIN
         width, height = (int(n) for n in np.ceil(plane.max(axis=0)) + _MARGIN - first)
         pinhole = Intrinsics(width, height, lens.fx, lens.fy, -float(first[0]), -float(first[1]))
-        pose = camera.c2w.copy()
-        pose[:3, :3] = pose[:3, :3] @ rotation
-        places = (plane - first).astype(np.float32)
-        for name, drawn in render_pinhole(Camera(pinhole, pose)).items():
-            picture = np.asarray(drawn, np.float32)
-            whole = out.setdefault(name, np.zeros((len(directions), *picture.shape[2:]), np.float32))
-            whole[chosen] = _resampled(name, picture.reshape(height, width, -1), places).reshape(whole[chosen].shape)
-    return {name: a.reshape(lens.height, lens.width, *a.shape[1:]) for name, a in out.items()}
+        faces.append(_Face(rotation, chosen, pinhole, (plane - first).astype(np.float32)))
+    return tuple(faces)
 
 
 def _faces(directions: Float) -> list[tuple[NDArray[np.float64], NDArray[np.bool_] | slice]]:

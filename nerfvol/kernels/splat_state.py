@@ -21,9 +21,6 @@ from nerfvol.splats.splats import Splats, rotations
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
 
-NEAR_SHARE = 0.02
-"""The near plane as a share of the subject's distance, where nobody says more."""
-
 
 @dataclass(frozen=True)
 class SplatView:

@@ -53,7 +53,8 @@ def _all_pairs(
     run = max(1, _PAIRS // len(points))
     for at in range(0, len(asked), run):
         part = asked[at : at + run]
-        distance = sum((part[:, None, axis] - points[None, :, axis]) ** 2 for axis in range(3))
+        x, y, z = ((part[:, None, axis] - points[None, :, axis]) ** 2 for axis in range(3))
+        distance = x + y + z
         if queries is None:
             distance[np.arange(len(part)), at + np.arange(len(part))] = np.inf
         order = np.argsort(distance, axis=1, kind="stable")[:, :found]

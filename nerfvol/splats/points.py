@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +42,7 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def __getitem__(self, chosen: ArrayLike | slice) -> PointCloud:
+    def __getitem__(self, chosen: NDArray[Any] | Sequence[int] | slice) -> PointCloud:
         """The chosen points (numbers, mask or slice)."""
         normals = None if self.normals is None else self.normals[chosen]
         return PointCloud(self.positions[chosen], self.colours[chosen], normals)
@@ -53,8 +55,9 @@ class PointCloud:
     @staticmethod
     def joined(a: PointCloud, b: PointCloud) -> PointCloud:
         """Both clouds' points; normals only where both have them."""
-        both = a.normals is not None and b.normals is not None
-        normals = np.concatenate([a.normals, b.normals]) if both else None  # type: ignore[list-item]
+        normals = None
+        if a.normals is not None and b.normals is not None:
+            normals = np.concatenate([a.normals, b.normals])
         return PointCloud(np.concatenate([a.positions, b.positions]), np.concatenate([a.colours, b.colours]), normals)
 
 
@@ -81,7 +84,9 @@ def read_points(path: str | os.PathLike[str]) -> PointCloud:
         return PointCloud(positions, colours.astype(np.float32), _unit_normals(normals))
 
 
-def _first_of(table, choices, convert) -> NDArray | None:
+def _first_of(
+    table: Mapping[str, NDArray], choices: Sequence[tuple[str, str, str]], convert: Callable[[NDArray], NDArray]
+) -> NDArray | None:
     """The first triple of properties that the table has, as an array (n, 3)."""
     for names in choices:
         if all(name in table for name in names):

@@ -18,7 +18,7 @@ from nerfvol.config.splats import SplatConfig
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels import splat_ops
-from nerfvol.kernels.splat_state import NEAR_SHARE, SplatOptions, SplatRates, SplatState, view_of
+from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatState, view_of
 from nerfvol.kernels.state import StepReport
 from nerfvol.splats.packing import LOGIT
 from nerfvol.splats.splats import Splats
@@ -27,8 +27,8 @@ from nerfvol.views import SplatModel
 
 VIEWS, SPLITS = 3, 4
 """Streams of random numbers; octree training has 0 to 2."""
-ERROR_KEPT = 0.3
-"""Of the sum of errors of a Gaussian after a round of splitting: what it was slow to learn counts again."""
+NEAR_SHARE = 0.02
+"""Of the subject's distance: what is nearer to a camera is not drawn."""
 SECONDS_TO_WRITE = 0.3
 
 
@@ -169,16 +169,9 @@ class SplatTrainer:
             )
         if not keep.all():
             state.prune(keep)
-        wanted = self.schedule.planned(self.started_with, progress) - state.n
-        error = state.per_splat("error").astype(np.float64) ** 0.7
-        candidates = np.flatnonzero(error > 0)
-        count = min(wanted, len(candidates))
-        if count > 0 and progress < self.schedule.grown:
-            random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, SPLITS, self.steps_done])))
-            # The largest of log(u) / p: a weighted draw without replacement (Efraimidis & Spirakis 2006).
-            keys = np.log(random.random(len(candidates))) / error[candidates]
-            state.split(candidates[np.argpartition(-keys, count - 1)[:count]])
-        state.error *= ERROR_KEPT
+        growing = progress < self.schedule.grown
+        wanted = self.schedule.planned(self.started_with, progress) - state.n if growing else 0
+        state.grow(wanted, np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, SPLITS, self.steps_done]))))
         state.reorder()
 
     def take_model(self, metadata: dict[str, Any]) -> SplatModel:

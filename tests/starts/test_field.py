@@ -197,7 +197,7 @@ def test_a_hazy_field_has_coarser_leaves() -> None:
         found = candidate_cells(Blob(), Frame.of(DOMAIN, 5), config, messages)
         assert all(np.array_equal(*pair) for pair in zip(found, candidates[which], strict=True)), most
         if which:
-            assert len(messages) == 1 and f"1/{32 >> which} of the region" in messages[0] and "hazy" in messages[0]
+            assert len(messages) == 1 and f"1/{32 >> which} of the inner cube" in messages[0] and "hazy" in messages[0]
         else:
             assert not messages
 
