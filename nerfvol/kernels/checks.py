@@ -37,7 +37,7 @@ def check_coarse(octree: Octree, origins: np.ndarray, coarse) -> float:
     """``coarse``, or 0 where no node is so small from any of ``origins``; ValueError where it is negative or not finite."""
     if not 0 <= coarse < np.inf:
         raise ValueError(f"coarse must be an angle in radians, 0 or more and finite, got {coarse}")
-    return float(coarse) if coarse > 0 and lod.may_stand_in(octree, origins, coarse) else 0.0
+    return float(coarse) if coarse > 0 and lod.has_lod_cut(octree, origins, coarse) else 0.0
 
 
 def check_background(background) -> list[float]:

@@ -38,14 +38,14 @@ def _per_ray(rays_o, n: int) -> Tensor:
 def render_rays(octree: Octree, o, d, bg, eps, outputs, coarse: float = 0.0) -> dict[str, np.ndarray]:
     """ops.render_rays on the reference, with arguments that were checked there.
 
-    Where nodes stand in for their leaves, rays are rendered origin by origin, each on the octree cut as seen from there.
+    Where prefiltered nodes are drawn, rays are rendered origin by origin, each on the octree cut as seen from there.
     """
     if coarse == 0 or not len(d):
         return _render_leaves(octree, o, d, bg, eps, outputs)
     out = {name: np.empty((len(d), 3) if name in ("rgb", "normal") else len(d), np.float32) for name in outputs}
     origins, of_ray = np.unique(_per_ray(o, len(d)).numpy(), axis=0, return_inverse=True)
     for index, origin in enumerate(origins):
-        tree = lod.cut(octree, lod.standing_in(octree, origin, coarse))
+        tree = lod.cut(octree, lod.lod_cut(octree, origin, coarse))
         rays = np.flatnonzero(of_ray.reshape(-1) == index)
         part = _render_leaves(tree, np.repeat(origin[None], len(rays), axis=0), d[rays], bg, eps, outputs)
         for name in outputs:

@@ -79,7 +79,7 @@ def render_rays(
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
     by less than that; 0 is exact. A node whose side is below ``coarse`` times the distance of its centre from the ray's
-    origin stands in for its leaves (nerfvol.octree.lod); 0: none does. Raises ValueError where rays, background,
+    origin is drawn as one prefiltered cell (nerfvol.octree.lod); 0: none is. Raises ValueError where rays, background,
     threshold, outputs or coarse are not what they should be.
     """
     o, d = check_rays(rays_o, rays_d)
@@ -153,7 +153,7 @@ def train_step(
     """
     o, d, _, _ = check_batch(batch, options)
     state.check(octree)
-    octree.averages = None
+    octree.prefiltered = None
     if (compiled := native()) is None:
         return _on_torch().train_step(octree, state, batch, options, rates, pixel_angle)
     report = compiled.train_step(

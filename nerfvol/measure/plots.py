@@ -49,7 +49,7 @@ def training_curve(run: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float
 
 
 def draw_bench(path: str, record: dict[str, Any], run_folders: Sequence[str]) -> None:
-    """Write the picture of a ``nerfvol bench`` record, with the curves of ``run_folders`` beside it."""
+    """Write the picture of a ``nerfvol bench`` record, with the curves of ``run_folders`` next to it."""
     figure = bench_figure(record, run_folders)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=130)

@@ -212,7 +212,7 @@ class Run:
             self.data.training.release()
 
     def preview(self, phase: Phase, moment: float) -> None:
-        """The first held-out view, small: truth beside what the phase has."""
+        """The first held-out view, small: truth next to what the phase has."""
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
         truth = composite_average(image, self.config.background, k).astype(np.float32) / 255

@@ -20,7 +20,7 @@ from typing import Any
 from tqdm import tqdm
 
 from nerfvol import __version__
-from nerfvol.config.training import Config
+from nerfvol.config.training import FINEST_LEVEL, Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
@@ -131,7 +131,7 @@ def announce(run: Run, memory: str) -> None:
 
 # ------------------------------------------------------------------ the loop
 def optimise(run: Run, phase: Phase) -> None:
-    """Steps until the phase is over, with all that goes on beside them."""
+    """Steps until the phase is over, with all that goes on around them."""
     run.enter(phase)
     progress = run.progress(phase)
     with progress_bar(phase.name, progress) as bar:
@@ -171,9 +171,7 @@ def start_from_field(run: Run) -> Octree:
     run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
                             "MB": field.parameter_bytes / 1e6}  # fmt: skip
     settings = dataclasses.replace(
-        config.distill,
-        level=min(config.distill.level or 16, max(config.octree.levels)),
-        sh_degree=config.octree.sh_degree,
+        config.distill, level=min(config.distill.level or FINEST_LEVEL, max(config.octree.levels))
     )
     started = time.perf_counter()
     octree, report = distill(field.trained_field(), field.domain, data.training, background, settings, field.picture)

@@ -204,7 +204,7 @@ octree:
   steps: 300
   levels: [4, 5, 5]
   downscales: [2, 1, 1]
-  until: [0.2, 0.5, 1.0]
+  stage_ends: [0.2, 0.5, 1.0]
   tiles: [16, 16, 16]
   prunes: [1, 1, 1]
 """
