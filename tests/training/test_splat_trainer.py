@@ -55,7 +55,9 @@ def splats_of(run: Path) -> bytes:
 @pytest.fixture(scope="module")
 def photographs_folder(tmp_path_factory) -> Path:
     cameras = facing_cameras(12, Intrinsics(56, 40, 55.0, 55.0, 28.0, 20.0))
-    return write_photographs(tmp_path_factory.mktemp("photographs"), cameras, [draw(c, trace_planes, 2) for c in cameras])
+    return write_photographs(
+        tmp_path_factory.mktemp("photographs"), cameras, [draw(c, trace_planes, 2) for c in cameras]
+    )
 
 
 # ---------------------------------------------------------------- the same numbers
@@ -538,7 +540,12 @@ def test_a_wrong_start_is_one_sentence(tmp_path, tiny_scene, command, sphere_oct
 def test_the_reference_path_trains_too(tmp_path):
     """The same picture after a few steps, to rounding."""
     scene = write_scene(tmp_path / "scene", {"train": 3, "val": 1}, size=24)
-    plan = {**TINY, "representation": "splats", "data": str(scene), "splats": {"steps": 5, "grow_every": 2, "max_splats": 60}}
+    plan = {
+        **TINY,
+        "representation": "splats",
+        "data": str(scene),
+        "splats": {"steps": 5, "grow_every": 2, "max_splats": 60},
+    }
     (tmp_path / "tiny.yaml").write_text(json.dumps({**plan, "checkpoint_every": 1000}))
     for name, environment in (("kernels", {}), ("reference", {"NERFVOL_REFERENCE": "1"})):
         arguments = ["train", "--out", str(tmp_path / name), "--config", str(tmp_path / "tiny.yaml")]
