@@ -71,11 +71,11 @@ def single_scattering(title: str, scene: Scene, size: int, beams: int, repeats: 
             return method.render(scene, camera)
 
         wall, cpu = seconds(again, repeats)
-        _, again = seconds(lambda method=method: method.render(scene, camera), repeats)
+        _, next_view = seconds(lambda method=method: method.render(scene, camera), repeats)
         rays = rays or (wall, cpu)
         error, rms, bias = errors(method.render(scene, camera).rgb, truth)
         print(
-            f"| {name} | {wall:.3f} | {cpu:.3f} | {again:.3f} | {rays[0] / wall:.1f} | {rays[1] / cpu:.1f} | {error:.2%} "
+            f"| {name} | {wall:.3f} | {cpu:.3f} | {next_view:.3f} | {rays[0] / wall:.1f} | {rays[1] / cpu:.1f} | {error:.2%} "
             f"| {rms:.2%} | {bias:+.2%} |",
             flush=True,
         )

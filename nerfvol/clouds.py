@@ -16,6 +16,7 @@ from nerfvol.errors import InputError
 from nerfvol.kernels.checks import check_background, check_early_stop
 from nerfvol.kernels.splat_state import view_of
 from nerfvol.kernels.state import OUTPUTS
+from nerfvol.octree.io import storage_of
 from nerfvol.splats.io import save_splats
 from nerfvol.splats.ply import is_splat_ply
 from nerfvol.splats.points import PointCloud, read_points, splats_of_points
@@ -93,7 +94,8 @@ class PointModel:
         }
 
     def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
-        """The Gaussians that draw the points, as a file of splats."""
+        """The Gaussians that draw the points, as a file of splats; ``storage`` as in SplatModel.save."""
+        storage_of(storage)
         return save_splats(path, self.splats, self.metadata)
 
 

@@ -19,7 +19,7 @@ from nerfvol.kernels import ops
 from nerfvol.kernels.splat_ops import render_splats
 from nerfvol.kernels.splat_state import view_of
 from nerfvol.kernels.state import OUTPUTS, in_squares
-from nerfvol.octree.io import Storage, load_octree, save_octree
+from nerfvol.octree.io import load_octree, save_octree, storage_of
 from nerfvol.octree.tree import Octree
 from nerfvol.splats.io import load_splats, save_splats
 from nerfvol.splats.packing import PackedSplats, as_packed, unpack
@@ -108,9 +108,9 @@ class OctreeModel:
         """The model in an octree file; InputError where it is none."""
         return cls(*load_octree(path))
 
-    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
+    def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
         """See models.Model; storage: "float32", "float16" or "compact" (octree.io.save_octree)."""
-        return save_octree(path, self.octree, self.metadata, storage)
+        return save_octree(path, self.octree, self.metadata, storage_of(storage))
 
     def render(
         self,
@@ -201,7 +201,8 @@ class SplatModel:
             raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
-        """See models.Model; splats have one storage."""
+        """See models.Model; splats have one storage, and every name of an octree's means it."""
+        storage_of(storage)
         return save_splats(path, self.splats, self.metadata)
 
     def render(

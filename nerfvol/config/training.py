@@ -279,6 +279,26 @@ PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_e
 """Settings of an octree where nothing else is said."""
 
 
+@dataclass(frozen=True)
+class SceneChoices:
+    """The settings of an octree that the kind of scene decides, as numbers: in OctreeConfig each may be None."""
+
+    sh_degree: int
+    rate_decay: float
+    decay_from: float
+    coarse_error: float
+    growing_error: float
+    tv_density: float
+    tv_sh: float
+    tv_from: int
+
+    @classmethod
+    def of(cls, config: OctreeConfig, scene: SceneBounds) -> SceneChoices:
+        """Those of ``config`` for ``scene``."""
+        settings = config.for_scene(scene)
+        return cls(**{field.name: getattr(settings, field.name) for field in dataclasses.fields(cls)})
+
+
 OCTREE_STARTS = ("direct", "mlp")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "random")
 """Besides a file of splats."""

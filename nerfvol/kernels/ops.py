@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerfvol.defaults import DEFAULT_EARLY_STOP, WHITE
 from nerfvol.kernels.checks import (
@@ -66,8 +67,8 @@ def _on_torch() -> ModuleType:
 
 def render_rays(
     octree: Octree,
-    rays_o,
-    rays_d,
+    rays_o: ArrayLike,
+    rays_d: ArrayLike,
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,

@@ -52,7 +52,7 @@ def kernel_options(options: LossOptions | Rates) -> Any:
     out = getattr(_compiled(), type(options).__name__)()
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        setattr(out, field.name, float(value) if np.isscalar(value) else [float(x) for x in value])
+        setattr(out, field.name, float(value) if np.ndim(value) == 0 else [float(x) for x in value])
     return out
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import OctreeConfig
+from nerfvol.config.training import OctreeConfig, SceneChoices
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.tiles import Cursors, TileBank
 from nerfvol.errors import InputError
@@ -74,7 +74,7 @@ class OctreeTrainer:
         octree: Octree | None = None,
         plan: OctreePlan | None = None,
     ):
-        config = config.for_scene(dataset.scene)
+        config, self.chosen = config.for_scene(dataset.scene), SceneChoices.of(config, dataset.scene)
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
         self.octree = octree if octree is not None else self._low_density_start()
         self.state = ops.TrainState(self.octree)
@@ -94,7 +94,7 @@ class OctreeTrainer:
         self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.foreground_tiles / drawn) if plan else math.inf
 
     def _low_density_start(self) -> Octree:
-        return low_density_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
+        return low_density_octree(self.dataset, self.config.levels[0], self.chosen.sh_degree)
 
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
@@ -183,17 +183,17 @@ class OctreeTrainer:
         if self.bank is None:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
-        smooth = fade if self.steps_done >= c.tv_from else 0.0
+        smooth = fade if self.steps_done >= self.chosen.tv_from else 0.0
         options = ops.LossOptions(
             background=self._random_background(),
             colour=c.colour_weight * fade,
             distortion=c.distortion * fade,
-            tv_density=c.tv_density * smooth,
-            tv_sh=c.tv_sh * smooth,
+            tv_density=self.chosen.tv_density * smooth,
+            tv_sh=self.chosen.tv_sh * smooth,
             early_stop_eps=c.early_stop_eps,
         )
-        late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
-        rate = c.rate_decay**late
+        late = max(0.0, progress - self.chosen.decay_from) / (1 - self.chosen.decay_from)
+        rate = self.chosen.rate_decay**late
         rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=BETA)
         batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
@@ -224,7 +224,7 @@ class OctreeTrainer:
         footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
         fine = c.levels[self.stage] >= FINE_LEVEL
         for _ in range(1 if fine else c.levels[self.stage]):
-            transfer = self._split(error, footprint, c.subdivide_error if fine else c.coarse_error)
+            transfer = self._split(error, footprint, c.subdivide_error if fine else self.chosen.coarse_error)
             if transfer is None:
                 break
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
@@ -278,7 +278,7 @@ class OctreeTrainer:
             error, footprint = self.state.error, self.state.footprint
             if 1 - self._needed(c.prune_weight).mean() >= WORTH_PRUNING:
                 error, footprint = self.prune()
-            if not c.growing_error or self._split(error, footprint, c.growing_error) is None:
+            if not self.chosen.growing_error or self._split(error, footprint, self.chosen.growing_error) is None:
                 self._forget_statistics()
             self.prunings += 1
 

@@ -32,7 +32,7 @@ from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
 from nerfvol.training.memory import OctreePlan, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
-from nerfvol.training.phase import Phase
+from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.prepare import check_folder, load_data
 from nerfvol.training.session import Clock, Run, Say, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
@@ -86,9 +86,9 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
     data = load_data(config, say)
     run = Run(config, data, clock, saved, say)
     with run.interruptible(), run:
-        phase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
+        phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
         optimise(run, phase)
-        trained = [phase.take_model(run.metadata())]
+        trained: list[Model] = [phase.take_model(run.metadata())]
         del phase
         return finish(run, trained)
 

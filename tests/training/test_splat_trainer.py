@@ -519,7 +519,8 @@ def test_a_run_goes_on_without_the_file_it_began_with(tmp_path, whole):
     ("octree", "sweep", "expected auto, direct, mlp for octree, got 'sweep'"),
     ("octree", "FILE", "expected auto, direct, mlp for octree, got '.*octree.safetensors'"),
     ("auto", "fog", "expected auto, direct, mlp, points.* or a file of splats, got 'fog'"),
-    ("splats", "FILE", "expected splats, it is a model of octree"), ("auto", "FILE", "expected splats, it is a model of octree"),
+    ("splats", "FILE", "expected splats, it is a model of octree"),
+    ("auto", "FILE", "expected splats, it is a model of octree"),
     ("splats", "points", "the start 'points' cannot be used: .* without the points of a model"),
     ("mesh", "auto", "representation.*octree.*splats"),
 ])  # fmt: skip
