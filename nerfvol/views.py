@@ -193,7 +193,7 @@ class SplatModel:
         """The model in a file of splats, our own or, by its suffix, .ply or .spz; InputError where it is none."""
         reader = {".ply": load_ply, ".spz": load_spz}.get(Path(path).suffix.lower())
         splats, metadata = load_splats(path) if reader is None else (reader(path), {})
-        if not splats.n:
+        if reader is not None and not splats.n:
             raise InputError(f"{path} holds no Gaussians, so there is nothing to draw")
         try:
             return cls(splats, metadata)
