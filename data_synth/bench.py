@@ -1,7 +1,7 @@
 """The figures of docs/data_synth.md: ``nerfvol synth bench [one|sky|preview|views|mitsuba]``.
 
 Times are wall-clock and CPU seconds (all threads) of whole renders of one view: everything that depends on the lights
-(shadow maps) is made anew in each of the repetitions, of which the median counts. ``view`` is a further view of the
+(shadow maps) is made again in each of the repetitions, of which the median counts. ``view`` is a further view of the
 same scene. Compiled code is warmed up first. error is the sum of |picture - truth| over the sum of the truth, rms the
 root mean square over the mean of the truth, bias the relative error of the mean. The truth is the march with shadow
 rays and a quarter of the step.
@@ -66,16 +66,16 @@ def single_scattering(title: str, scene: Scene, size: int, beams: int, repeats: 
     for name, method in methods.items():
         method.render(scene, coarse)
 
-        def anew(method: March = method) -> Picture:
+        def again(method: March = method) -> Picture:
             scene.prepared.clear()
             return method.render(scene, camera)
 
-        wall, cpu = seconds(anew, repeats)
-        _, again = seconds(lambda method=method: method.render(scene, camera), repeats)
+        wall, cpu = seconds(again, repeats)
+        _, next_view = seconds(lambda method=method: method.render(scene, camera), repeats)
         rays = rays or (wall, cpu)
         error, rms, bias = errors(method.render(scene, camera).rgb, truth)
         print(
-            f"| {name} | {wall:.3f} | {cpu:.3f} | {again:.3f} | {rays[0] / wall:.1f} | {rays[1] / cpu:.1f} | {error:.2%} "
+            f"| {name} | {wall:.3f} | {cpu:.3f} | {next_view:.3f} | {rays[0] / wall:.1f} | {rays[1] / cpu:.1f} | {error:.2%} "
             f"| {rms:.2%} | {bias:+.2%} |",
             flush=True,
         )

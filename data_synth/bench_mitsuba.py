@@ -1,4 +1,4 @@
-"""The cumulus of ``bench.py`` in Mitsuba 3, beside the path tracer: ``nerfvol synth bench mitsuba``.
+"""The cumulus of ``bench.py`` in Mitsuba 3, next to the path tracer: ``nerfvol synth bench mitsuba``.
 
 Wants ``pip install mitsuba``. ``llvm_ad_rgb`` also wants an LLVM library of version 15 or later that Dr.Jit can use,
 named by DRJIT_LIBLLVM_PATH; without one that line says why it is missing.

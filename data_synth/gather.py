@@ -4,7 +4,7 @@ What a point x radiates towards wo is
     J(x, wo) = (1 - albedo) Le + albedo sum_k f_p(wo, w_k) L_k T_k(x).
 T_k(x), the transmittance to the distant light k, does not depend on the camera: it is swept once per scene and light
 (``sweep.py``) to the density's own samples. Seen from an eye outside the medium wo hardly changes from one sample to
-the next, so that once per view all of J is put down there beside rho, and a marching step costs one trilinear look-up,
+the next, so that once per view all of J is put down there next to rho, and a marching step costs one trilinear look-up,
 however many beams there are.
 
 An approximation: J is linear between samples. Its error falls with the square of the cell, at a shadow's edge with the

@@ -11,7 +11,8 @@ import json
 import data_synth as ds
 import nerfvol
 
-SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "until": [0.4, 1.0], "tiles": [64, 96], "prunes": [2, 2]}
+SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "stage_ends": [0.4, 1.0], "tiles": [64, 96],
+         "prunes": [2, 2]}  # fmt: skip
 
 parser = argparse.ArgumentParser()
 parser.add_argument("data", nargs="?", help="posed images: NeRF-synthetic, instant-ngp, nerfstudio, LLFF or COLMAP")

@@ -15,13 +15,13 @@ import nerfvol
 from nerfvol.octree.io import load_octree
 from nerfvol.octree.points import octree_density
 
-SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "until": [0.4, 1.0], "tiles": [64, 96], "prunes": [2, 2]}
+SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "stage_ends": [0.4, 1.0], "tiles": [64, 96],
+         "prunes": [2, 2]}  # fmt: skip
 run = Path(sys.argv[1] if len(sys.argv) > 1 else "run")
 if not run.exists():  # a small one
     scene = ds.write_dataset(ds.scenes.Showcase(), "scene", ds.Options(views=30, size=(80, 80)))
     nerfvol.train(data=scene, out=run, octree=SHORT)
 octree, _ = load_octree(run / "octree.safetensors")
-
 middle = octree.origin + octree.size / 2
 height = float(sys.argv[2]) if len(sys.argv) > 2 else middle[2]
 columns, rows = 72, 36  # characters are twice as high as wide

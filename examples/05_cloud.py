@@ -17,8 +17,8 @@ cloud = ds.scenes.cloud(resolution=resolution, density=6.0, coverage=0.8)
 scene = ds.write_dataset(cloud, "cloud", ds.Options(views=24, size=(64, 64)))
 
 # Media are no surfaces: the terms that gather what a ray sees in one place are nearly off.
-medium = {"levels": [4, 5], "downscales": [2, 1], "until": [0.3, 1.0], "tiles": [32, 64], "prunes": [1, 2]}
-medium |= {"steps": 300, "colour": 0.01, "distortion": 0.0}
+medium = {"levels": [4, 5], "downscales": [2, 1], "stage_ends": [0.3, 1.0], "tiles": [32, 64], "prunes": [1, 2]}
+medium |= {"steps": 300, "colour_weight": 0.01, "distortion": 0.0}
 run = nerfvol.train(data=scene, out="cloud_run", background="black", octree=medium)
 octree, _ = load_octree(run / "octree.safetensors")
 

@@ -28,7 +28,7 @@ for step in range(1, settings.steps + 1):
     if step % 25 == 0:
         print(f"step {step}: {report.psnr:.1f} dB on the batch, {report.samples:.0f} samples a ray")
 
-settings = DistillConfig(level=5, visibility_downscale=2, compare_downscale=2)
+settings = DistillConfig(level=5)
 octree, report = distill(trainer.trained_field(), trainer.domain, dataset, WHITE, settings, trainer.picture)
 print(report)
 save_octree("distilled.safetensors", octree, {"background": WHITE}, "compact")

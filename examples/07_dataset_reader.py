@@ -1,4 +1,4 @@
-"""07  A data set in a format of your own, poses.csv (name, eye, target) beside pictures; then training, step by step.
+"""07  A data set in a format of your own, poses.csv (name, eye, target) next to pictures; then training, step by step.
 
 A reader ends with cameras, uint8 images, names, and the region that the scene fills. docs/extending.md makes it a format.
 """
@@ -29,7 +29,7 @@ with open("poses.csv", "w") as file:
     for i, view in enumerate(scene.viewpoints.spread(20, 64, 64, seed=0)):
         Image.fromarray(ds.render(scene, view).rgba8(scene.exposure)).save(f"{i}.png")
         file.write(f"{i}.png,{','.join(map(str, view.c2w[:3, 3]))},0,0,0\n")
-stages = OctreeConfig(levels=[4, 5], downscales=[2, 1], until=[0.4, 1.0], tiles=[32, 64], prunes=[1, 1])
+stages = OctreeConfig(levels=[4, 5], downscales=[2, 1], stage_ends=[0.4, 1.0], tiles=[32, 64], prunes=[1, 1])
 trainer = OctreeTrainer(read(folder, view.focal, scene.aabb), (1.0, 1.0, 1.0), stages, seed=0, octree=None)
 reports = [trainer.step(step / 200) for step in range(200)]
 print(f"{trainer.octree.n_leaves} leaves, {-10 * np.log10(reports[-1].squared_error):.1f} dB on the last batch")

@@ -13,7 +13,8 @@ import nerfvol
 from nerfvol.octree.io import load_octree, save_octree
 from nerfvol.octree.points import octree_density
 
-SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "until": [0.4, 1.0], "tiles": [64, 96], "prunes": [2, 2]}
+SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "stage_ends": [0.4, 1.0], "tiles": [64, 96],
+         "prunes": [2, 2]}  # fmt: skip
 run = Path(sys.argv[1] if len(sys.argv) > 1 else "run")
 if not run.exists():  # a small one
     scene = ds.write_dataset(ds.scenes.Showcase(), "scene", ds.Options(views=30, size=(80, 80)))

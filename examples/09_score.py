@@ -13,7 +13,8 @@ import nerfvol
 from nerfvol.files import pictures
 from nerfvol.measure.scores import evaluate
 
-SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "until": [0.4, 1.0], "tiles": [64, 96], "prunes": [2, 2]}
+SHORT = {"steps": 300, "levels": [5, 6], "downscales": [2, 1], "stage_ends": [0.4, 1.0], "tiles": [64, 96],
+         "prunes": [2, 2]}  # fmt: skip
 run, scene = (Path(name) for name in (sys.argv[1:3] if len(sys.argv) > 2 else ("run", "scene")))
 if not run.exists():  # a small one
     ds.write_dataset(ds.scenes.Showcase(), scene, ds.Options(views=30, size=(80, 80)))

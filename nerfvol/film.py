@@ -55,7 +55,7 @@ class Film:
 
 
 def write_videos(path: Path, film: Film, fps: int) -> list[Path]:
-    """One video of the colours at ``path`` and one for each AOV beside it; returns their paths."""
+    """One video of the colours at ``path`` and one for each AOV next to it; returns their paths."""
     depths = depth_range(film.model, film.cameras)
     paths = {"rgb": path, **{name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in film.aov}}
     with contextlib.ExitStack() as stack:

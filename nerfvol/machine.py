@@ -20,7 +20,7 @@ def cpu_model() -> str:
         for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():
             if line.startswith(("model name", "Model")):
                 return line.split(":", 1)[1].strip()
-    except OSError:  # no such file beside Linux
+    except OSError:  # no such file outside Linux
         pass
     return platform.processor() or platform.machine()
 
@@ -49,7 +49,7 @@ def available_memory() -> int | None:
                 free = int(line.split()[1]) * 1024
                 total = total_memory()
                 return free if total is None else min(free, total)
-    except (OSError, ValueError, IndexError):  # beside Linux
+    except (OSError, ValueError, IndexError):  # outside Linux
         pass
     return total_memory()
 
@@ -68,7 +68,7 @@ def return_free_memory() -> None:
     """Give the system back what was freed, where the C library (glibc) holds on to it otherwise.
 
     Once arrays of a few megabytes have come and gone, glibc keeps such memory for the next ones; the images that a run
-    lets go of would stay in its resident size to the end.
+    releases would stay in its resident size to the end.
     """
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library
@@ -83,7 +83,7 @@ def keep_large_arrays_apart() -> None:
     """Larger arrays than LARGE_ARRAY get memory of their own, which goes back to the system with them (glibc).
 
     As they come and go glibc moves that bound up to 32 MiB, so that arrays of some megabytes leave holes between each other:
-    a tenth of what a run takes. What every step takes anew is better off as it is, for the system clears new memory.
+    a tenth of what a run takes. What every step takes again is better off as it is, for the system clears new memory.
     """
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library
@@ -99,7 +99,7 @@ def process_seconds() -> float:
         # Field 22 of stat(5): start in clock ticks after boot. The name before it may hold spaces, but ends with ")".
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError, AttributeError):  # beside Linux
+    except (OSError, ValueError, IndexError, AttributeError):  # outside Linux
         return time.perf_counter() - _imported
 
 

@@ -6,6 +6,7 @@ A representation joins by a class with :class:`Model`'s methods and a row in :da
 from __future__ import annotations
 
 import importlib
+import operator
 import os
 from collections.abc import Sequence
 from typing import Any, Protocol, cast
@@ -57,25 +58,43 @@ class Model(Protocol):
 
 
 FORMATS = {
-    "nerfvol octree": "nerfvol.views:OctreeModel",
-    "nerfvol splats": "nerfvol.views:SplatModel",
+    "nerfvol octree": "nerfvol.views:OctreeModel.load",
+    "nerfvol splats": "nerfvol.views:SplatModel.load",
 }
-"""The ``format`` key of a file's document, and the class whose ``load`` opens it."""
+"""The ``format`` key of a file's document, and what opens it."""
+SUFFIXES = {".ply": "nerfvol.clouds:load_ply_model", ".spz": "nerfvol.views:SplatModel.load"}
+"""Files of other programs, by the end of their names, and what opens them."""
 
 
 def load_model(target: str | os.PathLike[str]) -> Model:
-    """The model in a run folder or a file.
+    """The model in a run folder or a file: our own octrees and splats, Gaussians or points in a .ply, Gaussians in a .spz.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.
     """
     path = model_path(target)
-    with ArrayFile(path, "model file") as file:
-        known = FORMATS.get(str(file.document.get("format")))
-    if known is None:
-        raise InputError(f"{path}: its format is {file.document.get('format')!r}, expected one of {', '.join(FORMATS)}")
-    module, _, name = known.partition(":")
-    return cast(Model, getattr(importlib.import_module(module), name).load(path))
+    opener = SUFFIXES.get(path.suffix.lower())
+    if opener is None:
+        stated = str(describe_file(path).get("format"))
+        if stated not in FORMATS:
+            raise InputError(f"{path}: its format is {stated!r}, expected one of {', '.join(FORMATS)}")
+        opener = FORMATS[stated]
+    module, _, name = opener.partition(":")
+    return cast(Model, operator.attrgetter(name)(importlib.import_module(module))(path))
+
+
+def describe_file(target: str | os.PathLike[str]) -> dict[str, Any]:
+    """The JSON document in a model's file; of other programs' files the format alone."""
+    path = model_path(target)
+    if path.suffix.lower() in SUFFIXES:
+        return {"format": path.suffix.lower()}
+    try:
+        with ArrayFile(path, "model file") as file:
+            return file.document
+    except InputError as error:
+        raise InputError(
+            f"{error} (a model is a run folder, its .safetensors file, {' or '.join(SUFFIXES)})"
+        ) from error
 
 
 def save_model(path: str | os.PathLike[str], model: Model, storage: str = "compact") -> int:

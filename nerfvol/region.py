@@ -1,4 +1,4 @@
-"""The scene's region, in numbers only: an inner cube of detail and, for photographs, background shells of doubling cells.
+"""The scene's region, in numbers only: an inner cube and, for photographs, background shells of doubling cells.
 
 The inner cube is the smallest around ``aabb``. Each background shell reaches twice as far as the one inside it with cells
 twice as large, so that cells look about equally large from the middle.

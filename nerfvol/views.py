@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,11 +19,13 @@ from nerfvol.kernels import ops
 from nerfvol.kernels.splat_ops import render_splats
 from nerfvol.kernels.splat_state import view_of
 from nerfvol.kernels.state import OUTPUTS, in_squares
-from nerfvol.octree.io import Storage, load_octree, save_octree
+from nerfvol.octree.io import load_octree, save_octree, storage_of
 from nerfvol.octree.tree import Octree
 from nerfvol.splats.io import load_splats, save_splats
 from nerfvol.splats.packing import PackedSplats, as_packed, unpack
+from nerfvol.splats.ply import load_ply
 from nerfvol.splats.splats import Splats
+from nerfvol.splats.spz import load_spz
 
 if TYPE_CHECKING:
     from nerfvol.models import Model
@@ -42,8 +45,8 @@ def render_image(
 ) -> dict[str, Float]:
     """One view: float32 arrays (H, W, 3) or (H, W) for the names in ``outputs`` (see ops.render_rays).
 
-    ``rgb`` is not clipped. A node of the octree that is smaller than ``lod`` pixels in the middle of the picture stands in
-    for its leaves; 0: none does. ValueError where ``lod`` is negative or not finite.
+    ``rgb`` is not clipped. A node of the octree that is smaller than ``lod`` pixels in the middle of the picture is
+    drawn in place of its leaves; 0: none is. ValueError where ``lod`` is negative or not finite.
     """
     if not 0 <= lod < np.inf:
         raise ValueError(f"lod must be a number of pixels, 0 or more and finite, got {lod}")
@@ -105,9 +108,9 @@ class OctreeModel:
         """The model in an octree file; InputError where it is none."""
         return cls(*load_octree(path))
 
-    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
+    def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
         """See models.Model; storage: "float32", "float16" or "compact" (octree.io.save_octree)."""
-        return save_octree(path, self.octree, self.metadata, storage)
+        return save_octree(path, self.octree, self.metadata, storage_of(storage))
 
     def render(
         self,
@@ -157,7 +160,7 @@ class SplatModel:
         near = self.metadata.get("near")
         if near is not None and (type(near) not in (int, float) or not 0 < near < np.inf):
             raise InputError(f"splats: near must be a positive number, got {near!r:.60}")
-        self._near = NEAREST * self._extent() if near is None else float(near)
+        self.near = NEAREST * self._extent() if near is None else float(near)
 
     @property
     def splats(self) -> Splats:
@@ -187,15 +190,19 @@ class SplatModel:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SplatModel:
-        """The model in a file of splats; InputError where it is none."""
-        splats, metadata = load_splats(path)
+        """The model in a file of splats, our own or, by its suffix, .ply or .spz; InputError where it is none."""
+        reader = {".ply": load_ply, ".spz": load_spz}.get(Path(path).suffix.lower())
+        splats, metadata = load_splats(path) if reader is None else (reader(path), {})
+        if reader is not None and not splats.n:
+            raise InputError(f"{path} holds no Gaussians, so there is nothing to draw")
         try:
             return cls(splats, metadata)
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
-    def save(self, path: str | os.PathLike[str], storage: Storage = "compact") -> int:
-        """See models.Model; splats have one storage."""
+    def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
+        """See models.Model; splats have one storage, and every name of an octree's means it."""
+        storage_of(storage)
         return save_splats(path, self.splats, self.metadata)
 
     def render(
@@ -210,7 +217,7 @@ class SplatModel:
         colour = self.metadata.get("background", WHITE) if background is None else background
 
         def pinhole(seen: Camera) -> dict[str, Float]:
-            view = view_of(seen, self.packed.origin, max(self._near, self._nearest(seen)))
+            view = view_of(seen, self.packed.origin, max(self.near, self._nearest(seen)))
             return render_splats(self.packed, view, colour, early_stop_eps, outputs)
 
         return through_lens(pinhole, camera)

@@ -14,7 +14,7 @@ from nerfvol.errors import InputError
 from nerfvol.octree.io import load_octree
 
 SOURCE = Path(nerfvol.__file__)
-FEW = {"levels": [3, 4], "downscales": [2, 1], "until": [0.5, 1.0], "tiles": [8, 8], "prunes": [1, 1], "steps": 12}
+FEW = {"levels": [3, 4], "downscales": [2, 1], "stage_ends": [0.5, 1.0], "tiles": [8, 8], "prunes": [1, 1], "steps": 12}
 """Sections of a run of no length."""
 
 
@@ -81,7 +81,7 @@ def test_train_goes_on_with_the_settings_of_its_run(tiny_scene, tmp_path, capsys
     ({}, "train needs 'data'"),
     ({"data": "x"}, "train needs 'out'"),
     ({"data": "x", "out": "y", "time_buget": 3}, "did you mean 'time_budget'"),
-    ({"data": "x", "out": "y", "octree": {"steps": 0}}, "octree.steps must lie between"),
+    ({"data": "x", "out": "y", "octree": {"steps": 0}}, "octree.steps: expected a number of at least 1, got 0"),
     ({"data": "nowhere", "out": "y"}, "no such folder"),
     ({"out": "nowhere", "resume": True}, "nothing to resume"),
 ])  # fmt: skip

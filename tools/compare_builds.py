@@ -1,4 +1,4 @@
-"""Builds of the kernels against each other on one octree, in turns: milliseconds of thread time a step and a frame.
+"""Builds of the kernels against each other on one octree, interleaved: milliseconds of thread time a step and a frame.
 
     PYTHONPATH=. python tools/compare_builds.py OCTREE gcc=build/dev clang=build/clang
 
@@ -57,7 +57,7 @@ def work(path: str, degree: int) -> None:
 
 
 def compare(path: str, builds: dict[str, str], degree: int, rounds: int) -> None:
-    """Starts a process for each build, asks them in turns and prints a line for each instruction set and kind of work."""
+    """Starts a process for each build, asks them interleaved and prints a line for each instruction set and kind of work."""
     workers, isas = {}, []
     for name, folder in builds.items():
         environment = dict(os.environ, PYTHONPATH=os.pathsep.join([folder, os.environ.get("PYTHONPATH", "")]))

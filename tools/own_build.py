@@ -1,4 +1,4 @@
-"""Builds of the kernels in folders of their own, beside the installed one, and tests on them."""
+"""Builds of the kernels in folders of their own, next to the installed one, and tests on them."""
 
 from __future__ import annotations
 

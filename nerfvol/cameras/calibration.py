@@ -112,7 +112,7 @@ def read_calibration(data: Mapping[str, Any]) -> Calibration:
     if unsupported:
         raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
     lens = Fisheye if data.get("is_fisheye") is True else CAMERA_MODELS[model]
-    # What other lenses have is not read: exporters write zeros or leftovers of p1, p2 beside a fisheye lens.
+    # What other lenses have is not read: exporters write zeros or leftovers of p1, p2 next to a fisheye lens.
     coefficients = {name: finite_number(data, name) or 0.0 for name in lens.names()}
     degrees = {key: finite_number(data, key) for key in ("x_fov", "y_fov")}
     angles = [None if v is None else math.radians(v) for v in degrees.values()]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from nerfvol import __version__
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
-from nerfvol.cli.target import open_target
+from nerfvol.cli.target import Target, open_target
 from nerfvol.config.values import Count
 from nerfvol.errors import InputError
 
@@ -25,6 +25,12 @@ class BenchOptions:
     plot: str | None = None
     runs: tuple[str, ...] = ()
     threads: int = 0
+    ladder: str | None = None
+    out: str = ""
+    budgets: tuple[str, ...] = ("10s", "30s", "1m", "2m", "5m", "15m")
+    representations: tuple[Literal["octree", "splats"], ...] = ("octree", "splats")
+    published: Literal["none", "lego", "bonsai"] = "none"
+    settings: str | None = None
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
@@ -36,15 +42,23 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--json", metavar="FILE", help="write every figure as JSON")
     p.add_argument("--plot", metavar="FILE", help="draw the curves (.png, .svg or .pdf; needs nerfvol[plot])")
     p.add_argument("--runs", metavar="RUN", nargs="+", help="with --plot: also PSNR against seconds of these runs")
+    p.add_argument("--ladder", metavar="DATA", help="instead of measuring a model: train on DATA for each of --budgets and "
+                   "--representations, and write ladder.json, .md and .png; what is finished is not trained again")  # fmt: skip
+    p.add_argument("--out", metavar="DIR", help="with --ladder: the folder of its runs")
+    p.add_argument("--budgets", metavar="LIST", help="with --ladder (default: 10s,30s,1m,2m,5m,15m; also 500steps)")
+    p.add_argument("--representations", metavar="LIST", help="with --ladder (default: octree,splats)")
+    p.add_argument("--published", metavar="lego|bonsai|none", help="with --ladder: others' figures for comparison")
+    p.add_argument("--settings", metavar="FILE", help="with --ladder: YAML of training settings that all runs share")
 
 
 def run(options: BenchOptions) -> int:
     """Measure everything, print tables, write JSON where asked."""
+    if options.ladder is not None:
+        return run_ladder(options)
     need("bench", target=options.target)
-    from nerfvol.cameras.paths import orbit_cameras
     from nerfvol.files.atomic import write_json
     from nerfvol.machine import describe_hardware
-    from nerfvol.measure import bench, plots, roofline
+    from nerfvol.measure import plots
     from nerfvol.views import OctreeModel
 
     prepare_outputs(file=options.json)
@@ -52,15 +66,33 @@ def run(options: BenchOptions) -> int:
         plots.check_plot(options.plot, options.runs)
     threads = set_threads(options.threads)
     target = open_target(options.target)
-    if not isinstance(target.model, OctreeModel):
-        raise InputError(f"nerfvol bench measures octrees, {target.path} is a model of {target.model.kind}")
+    record = {"nerfvol": __version__, "hardware": describe_hardware(), "threads": threads}
+    record["representation"] = target.model.kind
+    if isinstance(target.model, OctreeModel):
+        record |= _measure_octree(target, options, threads)
+        print_tables(record)
+    else:
+        record |= _measure_splats(target, options, threads)
+        print_splat_tables(record)
+    if options.json is not None:
+        write_json(options.json, record)
+        print(f"figures: {options.json}")
+    if options.plot is not None:
+        plots.draw_bench(options.plot, record, options.runs)
+        print(f"picture: {options.plot}")
+    return 0
+
+
+def _measure_octree(target: Target, options: BenchOptions, threads: int) -> dict[str, Any]:
+    from nerfvol.cameras.paths import orbit_cameras
+    from nerfvol.measure import bench, roofline
+    from nerfvol.views import OctreeModel
+
+    assert isinstance(target.model, OctreeModel)
     octree, orbit = target.model.octree, target.orbit()
     machine = roofline.measure_machine(threads)
     views = {size: orbit_cameras(bench.VIEWS, orbit, (size, size)) for size in (*options.sizes, bench.BASE_SIZE)}
     record: dict[str, Any] = {
-        "nerfvol": __version__,
-        "hardware": describe_hardware(),
-        "threads": threads,
         "machine": {**vars(machine), "bandwidth": machine.bandwidth},
         "view_size": bench.BASE_SIZE,
         "octree": {"path": str(target.path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
@@ -71,28 +103,56 @@ def run(options: BenchOptions) -> int:
     record["exponents"] = bench.exponents(record["size"])
     if options.reference:
         record["reference"] = bench.measure_reference(octree, views[bench.BASE_SIZE], record)
-    print_tables(record)
-    if options.json is not None:
-        write_json(options.json, record)
-        print(f"figures: {options.json}")
-    if options.plot is not None:
-        plots.draw_bench(options.plot, record, options.runs)
-        print(f"picture: {options.plot}")
-    return 0
+    return record
+
+
+def _measure_splats(target: Target, options: BenchOptions, threads: int) -> dict[str, Any]:
+    from nerfvol.cameras.paths import orbit_cameras
+    from nerfvol.clouds import PointModel
+    from nerfvol.measure import bench, splat_bench
+    from nerfvol.views import SplatModel
+
+    model = target.model
+    if not isinstance(model, SplatModel | PointModel):
+        raise InputError(f"nerfvol bench measures octrees and splats, {target.path} is a model of {model.kind}")
+    views = [orbit_cameras(bench.VIEWS, target.orbit(), (size, size)) for size in options.sizes]
+    described = model.describe()
+    return {
+        model.kind: {"path": str(target.path), "count": described[model.kind], **described},
+        "file": splat_bench.measure_loading(target.path, options.repeats),
+        "render": splat_bench.measure(model, views, threads, options.repeats),
+    }
+
+
+def print_splat_tables(record: dict[str, Any]) -> None:
+    """The record of splats or points as text."""
+    kind = record["representation"]
+    _print_head(record, f"{record[kind]['path']}: {record[kind]['count']:,} {kind}")
+    _print_rates(record, "frames a second", "frames_per_second")
+    print()
+    _print_rates(record, "ms a training step", "train_step_ms")
+
+
+def _print_head(record: dict[str, Any], what: str) -> None:
+    hardware, file = record["hardware"], record["file"]
+    print(f"{hardware['cpu']}, {record['threads']} threads, kernels {hardware['kernel_path']}")
+    print(f"{what}, {file['bytes'] / 1e6:.1f} MB, loads in {file['seconds']:.2f} s\n")
+
+
+def _print_rates(record: dict[str, Any], title: str, key: str) -> None:
+    sizes = sorted({row["size"] for row in record["render"]})
+    print(f"{title:21s}" + "".join(f"{f'{size}x{size}':>12s}" for size in sizes))
+    for isa, threads in dict.fromkeys((row["isa"], row["threads"]) for row in record["render"]):
+        rates = {r["size"]: r[key] for r in record["render"] if (r["isa"], r["threads"]) == (isa, threads)}
+        plural = "s" if threads > 1 else " "
+        print(f"{isa:10s} {threads:2d} thread{plural} " + "".join(f"{rates[size]:12.2f}" for size in sizes))
 
 
 def print_tables(record: dict[str, Any]) -> None:
     """The record as text."""
-    hardware, octree, file = record["hardware"], record["octree"], record["file"]
-    print(f"{hardware['cpu']}, {record['threads']} threads, kernels {hardware['kernel_path']}")
-    megabytes = f"{file['bytes'] / 1e6:.1f} MB"
-    print(f"{octree['path']}: {octree['leaves']:,} leaves, {megabytes}, loads in {file['seconds']:.2f} s\n")
-    sizes = sorted({row["size"] for row in record["render"]})
-    print("frames a second      " + "".join(f"{f'{size}x{size}':>12s}" for size in sizes))
-    for isa, threads in dict.fromkeys((row["isa"], row["threads"]) for row in record["render"]):
-        rates = [r["frames_per_second"] for r in record["render"] if (r["isa"], r["threads"]) == (isa, threads)]
-        plural = "s" if threads > 1 else " "
-        print(f"{isa:10s} {threads:2d} thread{plural} " + "".join(f"{rate:12.2f}" for rate in rates))
+    octree = record["octree"]
+    _print_head(record, f"{octree['path']}: {octree['leaves']:,} leaves")
+    _print_rates(record, "frames a second", "frames_per_second")
     print(f"\nfinest grid      leaves   frames/s at {record['view_size']}²   training rays/s   segments/ray")
     for row in record["size"]:
         print(
@@ -132,9 +192,59 @@ def _print_roofline(record: dict[str, Any]) -> None:
         )
 
 
+def run_ladder(options: BenchOptions) -> int:
+    """Train what is not there yet, one after the other, and write what came of it."""
+    if options.target:
+        raise InputError("nerfvol bench takes either RUN|FILE or --ladder DATA, not both")
+    need("bench --ladder", ladder=options.ladder, out=options.out)
+    import time
+    from pathlib import Path
+
+    from nerfvol.config.assemble import assemble, read_yaml, to_plain
+    from nerfvol.config.training import Config
+    from nerfvol.files.atomic import read_json
+    from nerfvol.machine import describe_hardware
+    from nerfvol.measure import ladder
+
+    if not Path(str(options.ladder)).exists():
+        raise InputError(f"--ladder {options.ladder}: no such folder or file")
+    if not options.representations:
+        raise InputError("--representations: expected octree, splats or both")
+    budgets = ladder.budgets(options.budgets)
+    shared = (read_yaml(options.settings), options.settings) if options.settings else ({}, "settings")
+    prepare_outputs(folder=options.out)
+    threads = set_threads(options.threads)
+    configs = {}  # all settings are checked before the first run begins
+    for name in options.representations:
+        for budget, settings in budgets.items():
+            folder = Path(options.out) / f"{name}_{budget}"
+            own = {"data": options.ladder, "out": str(folder), "representation": name, "threads": options.threads}
+            configs[name, budget] = folder, assemble(Config, shared, (settings, "--budgets"), (own, "bench"))
+    rows: list[dict[str, Any]] = []
+    record: dict[str, Any] = {}
+    written: list[Path] = []
+    for (name, budget), (folder, config) in configs.items():
+        metrics = ladder.finished(folder, to_plain(config))
+        print(f"{name}, {budget}: {'finished before' if metrics else 'training'}", flush=True)
+        if metrics is None:
+            from nerfvol.training.train import train
+
+            train(config, started=time.perf_counter())
+            metrics = read_json(folder / "metrics.json")
+        rows.append(ladder.row_of(name, budget, folder, metrics))
+        record = {
+            "nerfvol": __version__, "hardware": describe_hardware(), "threads": threads, "data": options.ladder,
+            "rows": rows, "published": ladder.PUBLISHED[options.published],
+        }  # fmt: skip
+        written = ladder.write_ladder(Path(options.out), record)  # after each run: the next may take long
+    print(f"\n{ladder.table(record)}\nwritten: {', '.join(map(str, written))}")
+    return 0
+
+
 COMMAND = Command(
     summary="Measure rendering, loading and training speed.",
-    example="nerfvol bench run --sizes 400,800 --json bench.json --plot bench.png",
+    example="nerfvol bench run --sizes 400,800 --json bench.json --plot bench.png\n"
+    "nerfvol bench --ladder scene --out ladder --budgets 30s,2m",
     options=BenchOptions,
     arguments=arguments,
     run=run,

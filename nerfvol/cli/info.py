@@ -35,14 +35,12 @@ def run(options: InfoOptions) -> int:
         "kernel_paths": ops.available_isas(),
     }
     if options.target:
-        from nerfvol.files.arrayfile import ArrayFile
         from nerfvol.files.run_folder import model_path
-        from nerfvol.models import load_model
+        from nerfvol.models import describe_file, load_model
 
         path = model_path(options.target)
         model = load_model(path)
-        with ArrayFile(path, "model file") as file:
-            record["file"] = {"path": str(path), "bytes": path.stat().st_size, **file.document}
+        record["file"] = {"path": str(path), "bytes": path.stat().st_size, **describe_file(path)}
         record[model.kind] = model.describe()
     if options.json:
         print(json.dumps(record, indent=2))
@@ -63,6 +61,9 @@ def _print(record: dict[str, Any]) -> None:
         print(f"by resolution   {levels}")
         print(f"filled          {100 * stats['filled_share']:.3g} % of the root cube")
         print(f"density         {file['density']}, scale {file['density_scale']:g}")
+    for kind in ("splats", "points"):
+        for key, value in record.get(kind, {}).items():
+            print(f"{key.replace('_', ' '):15s} {f'{value:,}' if type(value) is int else json.dumps(value)}")
     print(f"nerfvol         {record['nerfvol']}")
     print(f"machine         {hardware['cpu']}, {hardware['cores']} cores, {hardware['memory_gib']} GiB")
     others = [path for path in record["kernel_paths"] if path != hardware["kernel_path"]]
@@ -70,6 +71,9 @@ def _print(record: dict[str, Any]) -> None:
 
 
 def _print_file(file: dict[str, Any]) -> None:
+    if "version" not in file:  # another program's
+        print(f"file            {file['path']} ({file['bytes'] / 1e6:.1f} MB)")
+        return
     print(f"file            {file['path']} ({file['bytes'] / 1e6:.1f} MB, {file.get('storage', 'float32')})")
     print(f"format          {file['format']} {file['version']}, written by nerfvol {file['nerfvol']}")
     print(f"colour          {file['colour']}, SH degree {file['sh_degree']}")

@@ -60,9 +60,10 @@ def guard(run: Callable[[], int]) -> int:
 
 def _sentence(error: Exception) -> str | None:
     """What to tell the user, or None where ``error`` is a defect of the program and the traceback is wanted."""
-    from data_synth.errors import InputError as SynthInputError
-
-    if isinstance(error, (InputError, SynthInputError)):
+    synth = sys.modules.get(
+        "data_synth.errors"
+    )  # where it was not loaded it was not raised, and loading it takes a second
+    if isinstance(error, InputError) or (synth is not None and isinstance(error, synth.InputError)):
         return " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return "the machine's memory is used up; try a larger --downscale"

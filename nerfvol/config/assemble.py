@@ -1,22 +1,23 @@
 """Settings: dataclasses filled from defaults < YAML file < command line, every value checked where it enters.
 
 The machinery knows no setting by name: a dataclass field's type annotation says what fits, and nested dataclasses are
-sections. ``Annotated[float | None, seconds]`` adds a parser that runs before the type is checked.
+sections. ``Annotated[float | None, seconds]`` adds a parser, ``Annotated[float, within(0, 1)]`` a range; what a section
+``Checked`` requires between its settings is looked at when all layers lie on each other.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import difflib
 import os
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
-from nerfvol.config.values import coerce
+from nerfvol.config.values import Checked, coerce, hints_of
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_bytes, write_text
 from nerfvol.files.run_folder import CONFIG
@@ -28,11 +29,13 @@ def assemble(cls: type[T], *layers: tuple[Mapping[str, Any], str]) -> T:
     """An instance of the dataclass ``cls``: its defaults, then each ``(mapping, source name)`` on top of the last.
 
     Raises:
-        InputError: an unknown key (the nearest known one is named) or a value that does not fit its annotation.
+        InputError: an unknown key (a near one is named, and what a former one is called now), a value that does not fit
+            its annotation, or settings that do not fit each other.
     """
     settings = cls()
     for mapping, source in layers:
         _update(settings, mapping, source, "")
+    _check(settings)
     return settings
 
 
@@ -91,35 +94,51 @@ def _plain(value: Any) -> Any:
 
 
 def _update(settings: Any, mapping: Mapping[str, Any], source: str, prefix: str) -> None:
-    known = {field.name for field in dataclasses.fields(settings) if field.init}
-    hints = typing.get_type_hints(type(settings), include_extras=True)
-    values = {}
+    hints = hints_of(type(settings))
     for key, value in mapping.items():
         name = str(key).replace("-", "_")
-        if name not in known:
-            raise InputError(f"{source}: unknown key {prefix + str(key)!r}{_nearest(name, known, prefix)}")
+        if name not in hints:
+            raise InputError(f"{source}: {_unknown(settings, name, prefix + str(key), prefix)}")
         current = getattr(settings, name)
-        if dataclasses.is_dataclass(current) and not isinstance(current, type):
+        if _is_section(current):
             if not isinstance(value, Mapping):
                 raise InputError(f"{source}: {prefix}{name} is a section, expected keys and values, got {value!r}")
-            current = dataclasses.replace(current)
+            current = copy.copy(current)
             _update(current, value, source, f"{prefix}{name}.")
-            values[name] = current
+            value = current
         else:
-            values[name] = coerce(value, hints[name], f"{source}: {prefix}{name}")
-    for name, value in values.items():
-        object.__setattr__(settings, name, value)  # also for frozen sections
-    check = getattr(settings, "__post_init__", None)
-    if values and check is not None:
-        try:
-            check()
-        except InputError as error:
-            raise InputError(f"{source}: {error}") from error
+            value = coerce(value, hints[name], f"{source}: {prefix}{name}")
+        object.__setattr__(settings, name, value)  # also in frozen sections
 
 
-def _nearest(name: str, known: set[str], prefix: str) -> str:
-    close = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.0)
-    return f"; did you mean {prefix + close[0]!r}?" if close else ""
+def _check(settings: Any) -> None:
+    for name in hints_of(type(settings)):
+        if _is_section(section := getattr(settings, name)):
+            _check(section)
+    if isinstance(settings, Checked):
+        settings.check()
+
+
+def _is_section(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
+
+
+def _unknown(settings: Any, name: str, key: str, prefix: str) -> str:
+    """What is wrong with a key that is no setting, and what it may have meant."""
+    former = settings.former.get(name) if isinstance(settings, Checked) else None
+    if former is not None and " " in former:
+        return f"{key} is no longer a setting: {former}"
+    if former is not None:
+        return f"{key} was renamed to {prefix}{former}"
+    known = list(hints_of(type(settings)))
+    near = difflib.get_close_matches(name, known, n=1)
+    inside = [
+        f"{part}.{name}"
+        for part in known
+        if _is_section(getattr(settings, part)) and hasattr(getattr(settings, part), name)
+    ]
+    meant = [*near, *inside]
+    return f"unknown key {key!r}" + (f"; did you mean {prefix + meant[0]!r}?" if meant else "")
 
 
 def run_settings(target: str | os.PathLike[str]) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 from nerfvol.errors import InputError
 
@@ -53,25 +54,64 @@ Seconds = Annotated[float, seconds]
 Colour = Annotated[tuple[float, float, float], colour]
 
 
-def positive(value: Any) -> Any:
-    """Refuses numbers below 1 (counts, sizes); what is no number is for the type's own check to refuse."""
-    try:
-        too_small = float(value) < 1
-    except (TypeError, ValueError):
-        return value
-    if too_small:
-        raise ValueError(f"expected a number of at least 1, got {value!r}")
-    return value
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """Numbers from ``low`` to ``high``, both included; without ``low`` itself where it is ``open``."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    open: bool = False
+
+    def check(self, value: float) -> None:
+        """A ValueError where ``value`` lies outside."""
+        if not self.low <= value <= self.high or self.open and value == self.low:
+            raise ValueError(f"expected a number {self}, got {value!r}")
+
+    def __str__(self) -> str:
+        low, high = f"{self.low:.12g}", f"{self.high:.12g}"
+        if self.open:
+            return f"above {low}" + ("" if self.high == math.inf else f" and at most {high}")
+        if self.high == math.inf:
+            return f"of at least {low}"
+        return f"of at most {high}" if self.low == -math.inf else f"from {low} to {high}"
 
 
-Count = Annotated[int, positive]
+def at_least(low: float) -> Interval:
+    """For ``Annotated``: numbers of at least ``low``."""
+    return Interval(low)
+
+
+def above(low: float, high: float = math.inf) -> Interval:
+    """For ``Annotated``: numbers above ``low``, up to ``high``."""
+    return Interval(low, high, open=True)
+
+
+def within(low: float, high: float) -> Interval:
+    """For ``Annotated``: numbers from ``low`` to ``high``."""
+    return Interval(low, high)
+
+
+Count = Annotated[int, at_least(1)]
+
+
+Rate = Annotated[float, within(0, 1e3)]
+
+
+Share = Annotated[float, within(0, 1)]
+
+
+Decay = Annotated[float, above(0, 1)]
+
+
+Weight = Annotated[float, at_least(0)]
 
 
 def coerce(value: Any, hint: Any, place: str) -> Any:
     """``value`` as the type ``hint``, or an :class:`InputError` that starts with ``place``.
 
-    Understands bool, int, float (finite), str, Path, None, Literal, unions, tuples, lists, dicts, dataclasses and
-    ``Annotated`` parsers. Strings that spell a number are numbers, for YAML 1.1 reads 1e-3 as a string.
+    Understands bool, int, float (finite), str, Path, None, Literal, unions, tuples, lists, dicts, dataclasses, and in
+    ``Annotated`` parsers, which run before the type is checked, and an :class:`Interval`, which is checked after it.
+    Strings that spell a number are numbers, for YAML 1.1 reads 1e-3 as a string.
     """
     try:
         return _coerce(value, hint)
@@ -88,7 +128,11 @@ def _coerce(value: Any, hint: Any) -> Any:
     if origin is Annotated:
         for parse in filter(callable, arguments[1:]):
             value = parse(value)
-        return _coerce(value, arguments[0])
+        value = _coerce(value, arguments[0])
+        for interval in arguments[1:]:
+            if isinstance(interval, Interval):
+                interval.check(value)
+        return value
     if origin is Literal:
         if value not in arguments or isinstance(value, bool) and not any(value is choice for choice in arguments):
             raise ValueError(f"expected {' or '.join(map(str, arguments))}, got {value!r}")
@@ -101,7 +145,58 @@ def _coerce(value: Any, hint: Any) -> Any:
         if not isinstance(value, Mapping):
             raise ValueError(f"expected keys and values, got {value!r}")
         return {_coerce(key, arguments[0]): _coerce(item, arguments[1]) for key, item in value.items()}
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type) and not isinstance(value, hint):
+        raise ValueError(f"expected {hint.__name__}(...), got {value!r}")
     return _SCALARS[hint](value) if hint in _SCALARS else value
+
+
+class Checked:
+    """A dataclass of settings whose values are checked by their annotations however it is made: from a file, the command
+    line or a call. ``section`` is its place among the settings ("octree"; "" at the top).
+
+    former: settings that are no more, by name: the present name of the same thing, or a reason with a blank in it ("it is
+    always 8") where there is none. Using one is refused in a sentence that says so.
+    """
+
+    section: ClassVar[str] = ""
+    former: ClassVar[Mapping[str, str]] = {}
+
+    def __post_init__(self) -> None:
+        prefix = f"{self.section}." if self.section else ""
+        for name, hint in hints_of(type(self)).items():
+            value = coerce(getattr(self, name), hint, prefix + name)
+            object.__setattr__(self, name, value)  # also in frozen sections
+        self.check()
+
+    def check(self) -> None:
+        """An InputError where settings do not fit each other; each alone is right."""
+
+
+@functools.cache
+def hints_of(cls: type) -> dict[str, Any]:
+    """The annotations of a dataclass's fields by name, ``Annotated`` as it is written."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cast(Any, cls)) if field.init}
+
+
+def same_length(settings: Checked, *names: str) -> None:
+    """An InputError unless these lists of ``settings`` have as many entries as the first, and that some."""
+    n = len(getattr(settings, names[0]))
+    if not n:
+        raise InputError(f"{settings.section}.{names[0]} must have an entry for each stage, got none")
+    for name in names[1:]:
+        if (got := len(getattr(settings, name))) != n:
+            raise InputError(
+                f"{settings.section}.{name} must have one entry per stage, as many as {settings.section}.{names[0]} ({n}), "
+                f"got {got}"
+            )
+
+
+def increasing_to_one(settings: Checked, name: str) -> None:
+    """An InputError unless this list of ``settings`` increases and ends with 1."""
+    ends = list(getattr(settings, name))
+    if ends != sorted(ends) or ends[-1] != 1:
+        raise InputError(f"{settings.section}.{name} must increase and end with 1, got {ends}")
 
 
 def _coerce_union(value: Any, choices: tuple[Any, ...]) -> Any:

@@ -48,7 +48,7 @@ FORMATS = (
     Format("NeRF-synthetic, instant-ngp, nerfstudio", "transforms.json or transforms_train.json", "transforms"),
     Format("LLFF", "poses_bounds.npy", "llff"),
     Format("COLMAP", "cameras and images in sparse/0", "colmap"),
-    Format("NSVF, BlendedMVS", "intrinsics.txt beside pose and rgb", "nsvf"),
+    Format("NSVF, BlendedMVS", "intrinsics.txt next to pose and rgb", "nsvf"),
 )
 """In this order: a folder that several recognise is read by the first."""
 

@@ -1,4 +1,4 @@
-"""LLFF: ``poses_bounds.npy`` beside a folder of photographs (``images``, ``images_4``, ``images_8``, ...).
+"""LLFF: ``poses_bounds.npy`` next to a folder of photographs (``images``, ``images_4``, ``images_8``, ...).
 
 Each row holds 17 numbers: a 3x5 matrix, row by row, and the near and far depth of what the image sees. The matrix is a
 camera-to-world pose whose axes are (down, right, backwards), and a last column (height, width, focal length) of the

@@ -1,4 +1,4 @@
-"""NSVF: ``intrinsics.txt`` beside ``pose/*.txt`` and ``rgb/*.png``, as NSVF's scenes and its BlendedMVS and Tanks and
+"""NSVF: ``intrinsics.txt`` next to ``pose/*.txt`` and ``rgb/*.png``, as NSVF's scenes and its BlendedMVS and Tanks and
 Temples come.
 
 A pose is a camera-to-world 4x4 matrix in OpenCV axes (x right, y down, z forward), named like its image. Names begin with

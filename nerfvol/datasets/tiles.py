@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,12 +21,25 @@ class Cursor:
     position: int = 0
 
 
+@dataclass
+class Cursors:
+    """How far both queues are: all that drawing remembers."""
+
+    foreground: Cursor = field(default_factory=Cursor)
+    background: Cursor = field(default_factory=Cursor)
+
+    @classmethod
+    def of(cls, state: Mapping[str, Mapping[str, int]]) -> Cursors:
+        """From what ``dataclasses.asdict`` made of them."""
+        return cls(Cursor(**state["foreground"]), Cursor(**state["background"]))
+
+
 class TileBank:
     """All training pixels of one pyramid level as tiles.
 
-    A tile is *plain* when all its pixels have the background's colour. Plain tiles teach little but are many: they are
-    drawn less often and weigh more, so that the expected loss stays the mean over all pixels. The plain tiles of a picture
-    share one tile of pixels: where much is background, the bank is a fraction of the pictures.
+    A *background tile* is one whose pixels all have the background's colour; the others are *foreground tiles*. Background
+    tiles teach little but are many: they are drawn less often and weigh more, so that the expected loss stays the mean over
+    all pixels. Those of a picture share one tile of pixels: where much is background, the bank is a fraction of the pictures.
     """
 
     def __init__(self, dataset: Dataset, background: Sequence[float], k: int):
@@ -49,13 +62,13 @@ class TileBank:
             insides.append(flat >= 0 if (flat < 0).any() else None)
             image_of.append(np.full(len(flat), i, np.int32))
             tile_of.append(np.arange(len(flat), dtype=np.int32))
-        self.plain = self.row == 0
+        self.is_background = self.row == 0
         self.image = np.concatenate(image_of)
         self.tile = np.concatenate(tile_of)
         self._inside = insides
         self._padded = any(inside is not None for inside in insides)
-        self.rich_tiles, self.plain_tiles = (
-            np.flatnonzero(chosen).astype(np.int32) for chosen in (~self.plain, self.plain)
+        self.foreground_tiles, self.background_tiles = (
+            np.flatnonzero(chosen).astype(np.int32) for chosen in (~self.is_background, self.is_background)
         )
 
     @property
@@ -68,15 +81,15 @@ class TileBank:
         """Rays of all tiles, padding included."""
         return self.n_tiles * TILE_RAYS
 
-    def draw(self, n: int, rich_share: float, seed: int, rich: Cursor, plain: Cursor) -> Batch:
-        """The next n tiles: a share of ``rich_share`` from the rich queue, the rest from the plain one."""
-        n_rich = n if not len(self.plain_tiles) else min(n, round(n * rich_share))
-        if not len(self.rich_tiles):
-            n_rich = 0
+    def draw(self, n: int, foreground_share: float, seed: int, cursors: Cursors) -> Batch:
+        """The next n tiles: a share of ``foreground_share`` from the foreground's queue, the rest from the background's."""
+        n_foreground = n if not len(self.background_tiles) else min(n, round(n * foreground_share))
+        if not len(self.foreground_tiles):
+            n_foreground = 0
         parts, weights = [], []
         for tiles, cursor, count, stream in (
-            (self.rich_tiles, rich, n_rich, 0),
-            (self.plain_tiles, plain, n - n_rich, 1),
+            (self.foreground_tiles, cursors.foreground, n_foreground, 0),
+            (self.background_tiles, cursors.background, n - n_foreground, 1),
         ):
             if count:
                 parts.append(_next(tiles, cursor, count, [seed, stream]))
@@ -114,14 +127,15 @@ def _tiled(image: np.ndarray) -> np.ndarray:
 
 
 def _sort_out(tiles: np.ndarray, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (1 + rich tiles, 64, 3), a plain tile first, and which of them each of ``tiles`` (n, 64, 3) has: (n,)."""
-    plain_tile = np.tile(np.round(np.asarray(background) * 255).astype(np.uint8), (1, TILE_RAYS, 1))
-    rich = (tiles != plain_tile).any((1, 2))
-    return np.concatenate([plain_tile, tiles[rich]]), np.where(rich, np.cumsum(rich), 0).astype(np.int32)
+    """Pixels (1 + foreground tiles, 64, 3), a background tile first; and which of these each of ``tiles`` (n, 64, 3) is."""
+    background_tile = np.tile(np.round(np.asarray(background) * 255).astype(np.uint8), (1, TILE_RAYS, 1))
+    foreground = (tiles != background_tile).any((1, 2))
+    pixels = np.concatenate([background_tile, tiles[foreground]])
+    return pixels, np.where(foreground, np.cumsum(foreground), 0).astype(np.int32)
 
 
-def rich_share(dataset: Dataset, background: Sequence[float], views: int = 4) -> float:
-    """Share of tiles that are not plain, in a few of the dataset's views: how large a TileBank will be."""
+def foreground_share(dataset: Dataset, background: Sequence[float], views: int = 4) -> float:
+    """Share of foreground tiles in a few of the dataset's views: how large a TileBank will be."""
     rows = dataset.evenly(views).pyramid(background, 1, lambda image: _sort_out(_tiled(image), background)[1])
     return float(np.mean(np.concatenate(rows) > 0))
 

@@ -47,10 +47,10 @@ class SHField(RadianceField, Protocol):
 
 @dataclass(frozen=True)
 class Domain:
-    """The region a field covers: a cube of detail and, around it, as much contracted background as ``outer`` asks for.
+    """The region a field covers: an inner cube and, around it, as much contracted background as ``outer`` asks for.
 
-    center (3,), half: the cube of detail is center +- half, in scene units.
-    outer: half edge of the whole region in units of ``half``; 1 = there is nothing outside the cube of detail.
+    center (3,), half: the inner cube is center +- half, in scene units.
+    outer: half edge of the whole region in units of ``half``; 1 = there is nothing outside the inner cube.
     """
 
     center: tuple[float, float, float]
@@ -64,7 +64,7 @@ class Domain:
         return torch.stack([center - self.half * self.outer, center + self.half * self.outer])
 
     def scaled(self, positions: Tensor) -> Tensor:
-        """Scene positions in units of the cube of detail, which becomes [-1, 1]**3."""
+        """Scene positions in units of the inner cube, which becomes [-1, 1]**3."""
         return (positions - positions.new_tensor(self.center)) / self.half
 
     def contract(self, positions: Tensor) -> Tensor:
@@ -140,7 +140,7 @@ class _Trunk(nn.Module):
 class NeuralField(nn.Module):
     """Encoding, trunk and head as ``FieldShape`` says; the base of ``MLPField`` and ``HashField``.
 
-    The optical thickness per edge of the detail cube, not per scene unit, comes out of the activation: a scene in
+    The optical thickness per edge of the inner cube, not per scene unit, comes out of the activation: a scene in
     millimetres and the same scene in metres train alike.
     """
 

@@ -1,6 +1,6 @@
 """Occupancy grid: where a field may be something, so that rays skip the rest while the field trains.
 
-The grid is a stack of cubes around the cube of detail of a ``Domain``, each twice as large as the one before and all
+The grid is a stack of cubes around the inner cube of a ``Domain``, each twice as large as the one before and all
 with the same number of cells (Mueller et al. 2022); a bounded scene has one. A cell remembers the largest coefficient
 the field was seen to have in it, decaying at each visit. Samples leave ``march`` packed: one row a kept segment.
 """
@@ -90,7 +90,7 @@ class OccupancyGrid:
 
     @property
     def fraction(self) -> float:
-        """Occupied share of the cells of the cube of detail."""
+        """Occupied share of the cells of the inner cube."""
         return float(self.occupied[: self.resolution**3].float().mean())
 
     def check_not_empty(self) -> None:
@@ -98,7 +98,7 @@ class OccupancyGrid:
         if not bool(self.occupied.any()):
             raise InputError(
                 "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
-                "the images' background and that the scene bounds contain the object, lower field.learning_rate or "
+                "the images' background and that the scene bounds contain the object, lower field.rate or "
                 "field.sparsity_weight, or start with --init direct"
             )
 
@@ -110,7 +110,7 @@ class OccupancyGrid:
         return torch.clamp(torch.maximum(wanted, torch.as_tensor(at_least)), 0, self.n_cubes - 1).long()
 
     def _indices(self, x: Tensor, y: Tensor, z: Tensor, resolution: int, cube: Tensor | None = None) -> Tensor:
-        """Flat cell index of points in units of the cube of detail ([-1, 1]); broadcasts; outside is clamped."""
+        """Flat cell index of points in units of the inner cube ([-1, 1]); broadcasts; outside is clamped."""
         if self.n_cubes > 1:
             if cube is None:
                 cube = self._cube_of(torch.maximum(torch.maximum(x.abs(), y.abs()), z.abs()))

@@ -39,7 +39,7 @@ def explain_os_error(error: OSError) -> str:
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside ``path``; on success sync it and rename it to ``path``, on failure remove it.
+    """Give a temporary path next to ``path``; on success sync it and rename it to ``path``, on failure remove it.
 
     The temporary name keeps the suffix of ``path``, since image and video writers choose their format by it.
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerfvol.kernels.state import OUTPUTS, TILE_RAYS, Batch, LossOptions
 from nerfvol.octree import lod
 from nerfvol.octree.tree import Octree
 
 
-def check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
+def check_rays(rays_o: ArrayLike, rays_d: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Both as contiguous float32; ValueError where they are no rays as the module's head says, or not finite."""
     o, d = (np.ascontiguousarray(a, dtype=np.float32) for a in (rays_o, rays_d))
     if d.ndim != 2 or d.shape[1] != 3:
@@ -26,21 +27,21 @@ def check_rays(rays_o, rays_d) -> tuple[np.ndarray, np.ndarray]:
     return o, d
 
 
-def check_early_stop(eps) -> float:
+def check_early_stop(eps: float) -> float:
     """``eps``; ValueError outside [0, 1)."""
     if not 0 <= eps < 1:  # also refuses NaN
         raise ValueError(f"early_stop_eps must lie in [0, 1), got {eps}")
     return float(eps)
 
 
-def check_coarse(octree: Octree, origins: np.ndarray, coarse) -> float:
+def check_coarse(octree: Octree, origins: np.ndarray, coarse: float) -> float:
     """``coarse``, or 0 where no node is so small from any of ``origins``; ValueError where it is negative or not finite."""
     if not 0 <= coarse < np.inf:
         raise ValueError(f"coarse must be an angle in radians, 0 or more and finite, got {coarse}")
-    return float(coarse) if coarse > 0 and lod.may_stand_in(octree, origins, coarse) else 0.0
+    return float(coarse) if coarse > 0 and lod.has_lod_cut(octree, origins, coarse) else 0.0
 
 
-def check_background(background) -> list[float]:
+def check_background(background: Iterable[float]) -> list[float]:
     """Three floats; ValueError where they are not three or not finite."""
     values = [float(x) for x in background]
     if len(values) != 3 or not np.isfinite(values).all():

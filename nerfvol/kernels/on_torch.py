@@ -6,9 +6,11 @@ Only this module and ``reference`` import torch, so that training an octree and 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nerfvol.defaults import WHITE
@@ -30,22 +32,30 @@ from nerfvol.octree import lod
 from nerfvol.octree.tree import Octree
 
 
-def _per_ray(rays_o, n: int) -> Tensor:
+def _per_ray(rays_o: ArrayLike, n: int) -> Tensor:
     o = torch.as_tensor(np.asarray(rays_o))
     return o if len(o) == n else o.repeat_interleave(TILE_RAYS, 0)[:n]
 
 
-def render_rays(octree: Octree, o, d, bg, eps, outputs, coarse: float = 0.0) -> dict[str, np.ndarray]:
+def render_rays(
+    octree: Octree,
+    o: np.ndarray,
+    d: np.ndarray,
+    bg: Sequence[float],
+    eps: float,
+    outputs: Sequence[str],
+    coarse: float = 0.0,
+) -> dict[str, np.ndarray]:
     """ops.render_rays on the reference, with arguments that were checked there.
 
-    Where nodes stand in for their leaves, rays are rendered origin by origin, each on the octree cut as seen from there.
+    Where prefiltered nodes are drawn, rays are rendered origin by origin, each on the octree cut as seen from there.
     """
     if coarse == 0 or not len(d):
         return _render_leaves(octree, o, d, bg, eps, outputs)
     out = {name: np.empty((len(d), 3) if name in ("rgb", "normal") else len(d), np.float32) for name in outputs}
     origins, of_ray = np.unique(_per_ray(o, len(d)).numpy(), axis=0, return_inverse=True)
     for index, origin in enumerate(origins):
-        tree = lod.cut(octree, lod.standing_in(octree, origin, coarse))
+        tree = lod.cut(octree, lod.lod_cut(octree, origin, coarse))
         rays = np.flatnonzero(of_ray.reshape(-1) == index)
         part = _render_leaves(tree, np.repeat(origin[None], len(rays), axis=0), d[rays], bg, eps, outputs)
         for name in outputs:
@@ -53,7 +63,15 @@ def render_rays(octree: Octree, o, d, bg, eps, outputs, coarse: float = 0.0) -> 
     return {name: out[name] for name in OUTPUTS if name in outputs}
 
 
-def _render_leaves(octree: Octree, o, d, bg, eps, outputs, chunk: int = 16384) -> dict[str, np.ndarray]:
+def _render_leaves(
+    octree: Octree,
+    o: np.ndarray,
+    d: np.ndarray,
+    bg: Sequence[float],
+    eps: float,
+    outputs: Sequence[str],
+    chunk: int = 16384,
+) -> dict[str, np.ndarray]:
     parts = []
     values = torch.from_numpy(octree.values)
     origins, directions = _per_ray(o, len(d)), torch.from_numpy(d)
@@ -75,8 +93,11 @@ class _Render(torch.autograd.Function):
     """The compiled renderer and its adjoint, for autograd."""
 
     @staticmethod
-    def forward(ctx, values, octree, o, d, bg, eps):
+    def forward(
+        ctx: Any, values: Tensor, octree: Octree, o: np.ndarray, d: np.ndarray, bg: Sequence[float], eps: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
         compiled = native()
+        assert compiled is not None
         n = len(d)
         rgb, trans, depth = (np.empty(shape, np.float32) for shape in ((n, 3), n, n))
         compiled.render(kernel_tree(octree, values.detach().numpy()), o, d, bg, eps, rgb, trans, depth, None, None)
@@ -84,12 +105,14 @@ class _Render(torch.autograd.Function):
         return torch.from_numpy(rgb), torch.from_numpy(trans), torch.from_numpy(depth)
 
     @staticmethod
-    def backward(ctx, d_rgb, d_trans, d_depth):
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        compiled = native()
+        assert compiled is not None
         values, octree, o, d, bg, eps = ctx.saved
         gradient = torch.zeros_like(values)
         slots = np.full(octree.n_vertices, -1, np.int32)
-        cotangents = (g.contiguous().numpy() for g in (d_rgb, d_trans, d_depth))
-        native().render_backward(
+        cotangents = (g.contiguous().numpy() for g in grad_outputs)
+        compiled.render_backward(
             kernel_tree(octree, values.numpy()), o, d, bg, eps, *cotangents, gradient.numpy(), slots
         )
         return gradient, None, None, None, None, None
@@ -98,8 +121,8 @@ class _Render(torch.autograd.Function):
 def render_values(
     octree: Octree,
     values: Tensor,
-    rays_o,
-    rays_d,
+    rays_o: ArrayLike,
+    rays_d: ArrayLike,
     background: Sequence[float] = WHITE,
     early_stop_eps: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,7 +162,9 @@ def loss_gradient(octree: Octree, values: Tensor, batch: Batch, options: LossOpt
     return torch.autograd.grad(total, leaf)[0]
 
 
-def _reference_loss(octree: Octree, values: Tensor, batch: Batch, options: LossOptions):
+def _reference_loss(
+    octree: Octree, values: Tensor, batch: Batch, options: LossOptions
+) -> tuple[Tensor, dict[str, Any]]:
     live = torch.from_numpy(batch.weight > 0)
     to = lambda a: torch.as_tensor(np.asarray(a)).to(values.dtype)  # noqa: E731
     origins, directions = _per_ray(batch.rays_o, len(batch.rays_d)), to(batch.rays_d)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerfvol.defaults import DEFAULT_EARLY_STOP, WHITE
 from nerfvol.kernels.checks import (
@@ -66,8 +67,8 @@ def _on_torch() -> ModuleType:
 
 def render_rays(
     octree: Octree,
-    rays_o,
-    rays_d,
+    rays_o: ArrayLike,
+    rays_d: ArrayLike,
     background: Sequence[float] = WHITE,
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
@@ -79,7 +80,7 @@ def render_rays(
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
     by less than that; 0 is exact. A node whose side is below ``coarse`` times the distance of its centre from the ray's
-    origin stands in for its leaves (nerfvol.octree.lod); 0: none does. Raises ValueError where rays, background,
+    origin is drawn as one prefiltered cell (nerfvol.octree.lod); 0: none is. Raises ValueError where rays, background,
     threshold, outputs or coarse are not what they should be.
     """
     o, d = check_rays(rays_o, rays_d)
@@ -153,7 +154,7 @@ def train_step(
     """
     o, d, _, _ = check_batch(batch, options)
     state.check(octree)
-    octree.averages = None
+    octree.prefiltered = None
     if (compiled := native()) is None:
         return _on_torch().train_step(octree, state, batch, options, rates, pixel_angle)
     report = compiled.train_step(

@@ -8,10 +8,12 @@ less than ``early_stop_eps`` in colour: the reference drops the segments behind 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from nerfvol.kernels.state import LossOptions
 from nerfvol.octree.rows import DENSITY_SLOT, sh_slots
 from nerfvol.octree.topology import MAX_LEVEL, OFFSETS
 from nerfvol.octree.tree import Octree
@@ -44,7 +46,6 @@ def intersect(octree: Octree, rays_o: Tensor, rays_d: Tensor) -> Segments:
     node_mask, leaf_mask = torch.from_numpy(octree.node_mask).long(), torch.from_numpy(octree.leaf_mask).long()
     first_node, first_leaf = torch.from_numpy(octree.first_node).long(), torch.from_numpy(octree.first_leaf).long()
     offsets = torch.from_numpy(OFFSETS)
-    octants = torch.arange(8)
 
     ray = torch.arange(len(rays_o))
     node = torch.zeros(len(rays_o), dtype=torch.long)
@@ -57,24 +58,24 @@ def intersect(octree: Octree, rays_o: Tensor, rays_d: Tensor) -> Segments:
         b = (lo + 1 / 2**level - o[ray][:, None]) * inverse[ray][:, None]
         near = torch.minimum(a, b).amax(-1).clamp_min(0)
         far = torch.maximum(a, b).amin(-1)
-        leaves, nodes = leaf_mask[node][:, None], node_mask[node][:, None]
-        below = (1 << octants) - 1
         hit = far > near
-        for present, collect in ((leaves, True), (nodes, False)):
-            which = hit & (present >> octants & 1).bool()
-            pair, octant = which.nonzero(as_tuple=True)
-            rank = _POPCOUNT[present[pair, 0] & below[octant]]
-            if collect:
-                found.append((ray[pair], first_leaf[node[pair]] + rank, near[which], far[which]))
-            else:
-                next_ray, next_node, next_ijk = ray[pair], first_node[node[pair]] + rank, child_ijk[pair, octant]
-        ray, node, ijk = next_ray, next_node, next_ijk
+        pair, octant, rank = _met(hit, leaf_mask[node])
+        found.append((ray[pair], first_leaf[node[pair]] + rank, near[pair, octant], far[pair, octant]))
+        pair, octant, rank = _met(hit, node_mask[node])
+        ray, node, ijk = ray[pair], first_node[node[pair]] + rank, child_ijk[pair, octant]
         if not len(ray):
             break
     ray, leaf, near, far = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(near, stable=True)
     order = order[torch.argsort(ray[order], stable=True)]
     return Segments(ray[order], leaf[order], near[order] * octree.size, far[order] * octree.size)
+
+
+def _met(hit: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of the boxes ``hit`` (n, 8) those whose bit ``present`` (n,) has: row, octant, and rank among the row's bits."""
+    octants = torch.arange(8)
+    row, octant = (hit & (present[:, None] >> octants & 1).bool()).nonzero(as_tuple=True)
+    return row, octant, _POPCOUNT[present[row] & ((1 << octants) - 1)[octant]]
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,9 @@ def _per_ray(n: int, ray: Tensor, rows: Tensor) -> Tensor:
     return rows.new_zeros((n, *rows.shape[1:])).index_add(0, ray, rows)
 
 
-def render(octree: Octree, values: Tensor, rays_o: Tensor, rays_d: Tensor, background: Tensor, early_stop_eps: float):
+def render(
+    octree: Octree, values: Tensor, rays_o: Tensor, rays_d: Tensor, background: Tensor, early_stop_eps: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """rgb (n, 3) over ``background`` (3,), transmittance (n,) and expected distance sum_i w_i t_i (n,)."""
     s = sample(octree, values, rays_o, rays_d, early_stop_eps)
     n, ray = len(rays_o), s.segments.ray
@@ -204,7 +207,9 @@ def roughness(octree: Octree, values: Tensor, leaf: Tensor) -> tuple[Tensor, Ten
     )
 
 
-def loss(octree: Octree, values: Tensor, rays_o, rays_d, target, weight, options) -> tuple[Tensor, dict]:
+def loss(
+    octree: Octree, values: Tensor, rays_o: Tensor, rays_d: Tensor, target: Tensor, weight: Tensor, options: LossOptions
+) -> tuple[Tensor, dict[str, Any]]:
     """The training loss of a batch (see ops.LossOptions) and the squared error per ray.
 
     sum_rays weight * ( |C - target|^2 + colour * (sum_i w_i |c_i - target|^2 + T |background - target|^2)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from nerfvol.kernels import splat_reference
-from nerfvol.kernels.splat_reference import Parameters
+from nerfvol.kernels.splat_reference import LossParts, Parameters
 from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatReport, SplatState, SplatView
 from nerfvol.splats import packing
 from nerfvol.splats.packing import PackedSplats
@@ -16,7 +16,7 @@ from nerfvol.splats.splats import Splats
 
 
 def render_splats(
-    splats: Splats | PackedSplats, view: SplatView, bg, eps: float, outputs: Sequence[str]
+    splats: Splats | PackedSplats, view: SplatView, bg: Sequence[float], eps: float, outputs: Sequence[str]
 ) -> dict[str, np.ndarray]:
     """splat_ops.render_splats on the reference, with arguments that were checked there."""
     plain = packing.unpack(splats) if isinstance(splats, PackedSplats) else splats
@@ -25,7 +25,9 @@ def render_splats(
     return {name: value.numpy() for name, value in out.items() if name in outputs}
 
 
-def gradient_rows(state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions):
+def gradient_rows(
+    state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions
+) -> tuple[np.ndarray, LossParts]:
     """Gradient (n, rows) of the loss in float32, and the loss's parts."""
     p = Parameters.of(state.splats(), torch.float32, requires_grad=True)
     parts = splat_reference.loss(p, view, image, options, state.mode)
@@ -41,7 +43,7 @@ def loss_gradient(
     return packing.to_blocks(rows, np.zeros(rows.shape[1], np.float32)), _report(parts)
 
 
-def _report(parts) -> SplatReport:
+def _report(parts: LossParts) -> SplatReport:
     return SplatReport(parts.of_pixels, parts.squared_error, int(parts.hit.sum()), 0, 0)
 
 

@@ -93,8 +93,8 @@ def _slopes(t: Tensor, f: float, c: float, size: int, axis: int) -> Tensor:
 
 def project(p: Parameters, view: SplatView, mode: str) -> Footprints:
     """How ``view`` sees the splats ``p``."""
-    like = {"dtype": p.means.dtype}
-    rotation, translation = torch.tensor(view.rotation, **like), torch.tensor(view.translation, **like)
+    dtype = p.means.dtype
+    rotation, translation = torch.tensor(view.rotation, dtype=dtype), torch.tensor(view.translation, dtype=dtype)
     t = p.means @ rotation.T + translation
     x, y, z = t.unbind(-1)
     u, v = _slopes(t, view.fx, view.cx, view.width, 0), _slopes(t, view.fy, view.cy, view.height, 1)
@@ -105,13 +105,13 @@ def project(p: Parameters, view: SplatView, mode: str) -> Footprints:
     axes = rotation_matrices(p.quats)
     a = jacobian @ rotation @ (axes * p.log_scales.exp()[:, None, :])
     flat = a @ a.transpose(1, 2)
-    covariance = flat + LOW_PASS * torch.eye(2, **like)
+    covariance = flat + LOW_PASS * torch.eye(2, dtype=dtype)
     opacity = torch.sigmoid(p.logits)
     if mode == "mip":
         flat_det = torch.linalg.cross(a[:, 0], a[:, 1]).square().sum(-1)
         ratio = flat_det / torch.det(covariance)
         opacity = opacity * ratio.clamp_min(LEAST_RHO**2).sqrt()
-    ray = p.means - torch.tensor(view.eye, **like)
+    ray = p.means - torch.tensor(view.eye, dtype=dtype)
     direction = ray / ray.norm(dim=-1, keepdim=True)
     colour = eval_colour(p.sh, direction).clamp_min(0)
     shortest = axes[torch.arange(len(axes)), :, p.log_scales.argmin(-1)]

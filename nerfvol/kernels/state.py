@@ -36,8 +36,8 @@ class View:
 def in_squares(picture: np.ndarray) -> np.ndarray:
     """A picture (H, W, k) by squares of 16x16 pixels: (square rows, square columns, 4, k, 64), contiguous.
 
-    A square is four strips of 4 rows; in a strip 2x2 pixels that touch stand beside each other (csrc/packet.h). Squares that
-    reach beyond the picture are filled by repeating its last row and column.
+    A square is four strips of 4 rows; in a strip 2x2 pixels that touch are stored next to each other (csrc/packet.h).
+    Squares that reach beyond the picture are filled by repeating its last row and column.
     """
     padding = ((0, -picture.shape[0] % SQUARE), (0, -picture.shape[1] % SQUARE), (0, 0))
     padded = np.pad(picture, padding, mode="edge") if padding != ((0, 0),) * 3 else picture
@@ -119,7 +119,7 @@ class LeafStatistics:
             self._check_array(name, (octree.n_leaves,), np.float32)
 
     def reset_statistics(self, n_leaves: int) -> None:
-        """Begins anew, for an octree of ``n_leaves``."""
+        """Begins again, for an octree of ``n_leaves``."""
         self.max_weight, self.error, self.footprint = (np.zeros(n_leaves, np.float32) for _ in range(3))
 
     def _check_array(self, name: str, shape: tuple[int, ...], dtype: type) -> None:
@@ -129,7 +129,7 @@ class LeafStatistics:
 
 
 class TrainState(LeafStatistics):
-    """What training keeps beside the octree: the leaves' statistics, and second moments (n_vertices, row) float32."""
+    """What training keeps next to the octree: the leaves' statistics, and second moments (n_vertices, row) float32."""
 
     def __init__(self, octree: Octree, moments: np.ndarray | None = None):
         """Moments are zero where none are given; ValueError where those given do not fit the octree."""

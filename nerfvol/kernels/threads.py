@@ -9,7 +9,7 @@ from nerfvol.native import native
 
 
 def set_threads(n: int) -> None:
-    """Threads of the kernels, and of torch where it is loaded or stands in for them; ValueError below 1."""
+    """Threads of the kernels, and of torch where it is loaded or does their work; ValueError below 1."""
     if n < 1:
         raise ValueError(f"threads must be at least 1, got {n}")
     if (compiled := native()) is not None:
@@ -21,7 +21,7 @@ def set_threads(n: int) -> None:
 
 
 def get_threads() -> int:
-    """Threads of the kernels, or of torch where it stands in for them."""
+    """Threads of the kernels, or of torch where it does their work."""
     compiled = native()
     if compiled is not None:
         return compiled.get_threads()

@@ -18,13 +18,13 @@ from nerfvol.octree.tree import Octree
 def kernel_tree(octree: Octree, values: np.ndarray, coarse: float = 0.0) -> Any:
     """The kernels' view of ``octree`` with ``values`` (n_vertices, row) in place of its own.
 
-    Where ``coarse`` > 0, nodes whose side is below ``coarse`` times their distance stand in for their leaves. Raises
+    Where ``coarse`` > 0, nodes whose side is below ``coarse`` times their distance are drawn in place of their leaves. Raises
     ValueError where the values do not fit the octree.
     """
     shape = (octree.n_vertices, 16 * BLOCKS[octree.sh_degree])
     if values.shape != shape or values.dtype != np.float32:
         raise ValueError(f"the octree's values must be float32 {shape}, got {values.dtype} {values.shape}")
-    averages = lod.node_averages(octree) if coarse > 0 else None
+    prefiltered = lod.prefiltered_nodes(octree) if coarse > 0 else None
     return _compiled().Tree(
         octree.node_mask,
         octree.leaf_mask,
@@ -36,8 +36,8 @@ def kernel_tree(octree: Octree, values: np.ndarray, coarse: float = 0.0) -> Any:
         [float(x) for x in octree.origin],
         octree.size,
         octree.density_scale,
-        averages and averages.corners,
-        averages and averages.values,
+        prefiltered and prefiltered.corners,
+        prefiltered and prefiltered.values,
         coarse,
     )
 
@@ -52,7 +52,7 @@ def kernel_options(options: LossOptions | Rates) -> Any:
     out = getattr(_compiled(), type(options).__name__)()
     for field in dataclasses.fields(options):
         value = getattr(options, field.name)
-        setattr(out, field.name, float(value) if np.isscalar(value) else [float(x) for x in value])
+        setattr(out, field.name, float(value) if np.ndim(value) == 0 else [float(x) for x in value])
     return out
 
 

@@ -49,15 +49,19 @@ def training_curve(run: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float
 
 
 def draw_bench(path: str, record: dict[str, Any], run_folders: Sequence[str]) -> None:
-    """Write the picture of a ``nerfvol bench`` record, with the curves of ``run_folders`` beside it."""
+    """Write the picture of a ``nerfvol bench`` record, with the curves of ``run_folders`` next to it."""
     figure = bench_figure(record, run_folders)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), dpi=130)
 
 
 def bench_figure(record: dict[str, Any], run_folders: Sequence[str]) -> Figure:
-    """Frames a second and training time a ray against leaves, each with its rooflines; with runs also their PSNR."""
+    """Frames a second and training time a ray against leaves, each with its rooflines; with runs also their PSNR. Of splats:
+    frames a second and milliseconds of a training step against the picture's side."""
     from matplotlib.figure import Figure
+
+    if "octree" not in record:
+        return _splat_figure(record, run_folders)
 
     panels = 3 if run_folders else 2
     figure = Figure(figsize=(5.2 * panels, 4.4), layout="constrained")
@@ -73,6 +77,29 @@ def bench_figure(record: dict[str, Any], run_folders: Sequence[str]) -> Figure:
         f"{machine['operations'] / 1e9:.0f} GFLOP/s",
         fontsize=10,
     )
+    return figure
+
+
+def _splat_figure(record: dict[str, Any], run_folders: Sequence[str]) -> Figure:
+    from matplotlib.figure import Figure
+
+    panels = 3 if run_folders else 2
+    figure = Figure(figsize=(5.2 * panels, 4.4), layout="constrained")
+    axes = figure.subplots(1, panels)
+    rows, columns = record["render"], {"frames_per_second": "frames / s", "train_step_ms": "ms a training step"}
+    for place, (key, unit) in zip(axes, columns.items(), strict=False):
+        for isa, threads in dict.fromkeys((row["isa"], row["threads"]) for row in rows):
+            chosen = [row for row in rows if (row["isa"], row["threads"]) == (isa, threads)]
+            line = [row["size"] for row in chosen], [row[key] for row in chosen]
+            place.plot(*line, "o-" if threads > 1 else "o--", label=f"{isa}, {threads} thread{'s' * (threads > 1)}")
+        place.set(xscale="log", yscale="log", xlabel="side of the picture / pixels", ylabel=unit)
+        place.grid(True, which="both", alpha=0.25)
+        place.legend(fontsize=8)
+    if run_folders:
+        _draw_runs(axes[2], run_folders)
+    hardware, count = record["hardware"], record[record["representation"]]["count"]
+    title = f"{hardware['cpu']}, {record['threads']} threads: {count:,} {record['representation']}"
+    figure.suptitle(title, fontsize=10)
     return figure
 
 

@@ -1,7 +1,7 @@
 """A recovered density against the true one that a synthetic scene carries: `nerfvol eval RUN --truth density.npz`.
 
 Colour alone fixes the density only where light passes through: deep inside an opaque medium any density renders alike.
-So opacity along chords stands beside it. Both are compared inside the box of the true grid alone: what stands outside,
+So opacity along chords is reported next to it. Both are compared inside the box of the true grid alone: what is outside,
 such as the floor under a smoke, is no part of that truth, and an octree holds it as well.
 """
 
@@ -116,7 +116,7 @@ def compare(octree: Octree, grid: Grid, seed: int = 0) -> dict[str, float]:
     )
     start, direction, length = random_chords(grid.lo, grid.hi, seed)
     depth = np.array([_optical_depth(grid, *chord) for chord in zip(start, direction, length, strict=True)])
-    # An octree's ray has no end of its own: it ends with the part of the octree that stands in the box.
+    # An octree's ray has no end of its own: it ends with the part of the octree that lies in the box.
     medium, opacity = within_box(octree, grid.lo, grid.hi, float(grid.voxel.min())), np.zeros(len(start))
     if medium is not None:
         opacity = ops.render_rays(medium, start, direction, early_stop_eps=0.0, outputs=("opacity",))["opacity"]

@@ -7,7 +7,7 @@ Per vertex there is one raw density and 3 x K SH coefficients. Each becomes a 16
 - colour: an orthonormal rotation of (R, G, B) to (grey, red-blue, green-magenta), then round(coefficient / step). All
   SH functions have the same mean square 1 / (4 pi), so one step for all bands spreads the error as evenly as it can.
 
-Where it saves bytes a channel stores differences to the previous vertex (vertices stand along a Morton curve, so the
+Where it saves bytes a channel stores differences to the previous vertex (vertices are stored along a Morton curve, so the
 previous one is mostly a neighbour). Codes are zigzag-mapped (0, -1, 1, -2, ... to 0, 1, 2, 3, ...) and split into a
 low and a high byte plane, each deflated on its own: the high planes are nearly all zero and cost next to nothing.
 """

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
@@ -31,6 +31,13 @@ read up to twice that, since quantisation may round a value at the bound upwards
 Storage = Literal["float32", "float16", "compact"]
 
 
+def storage_of(name: str) -> Storage:
+    """``name`` where it is one of Storage; InputError where it is not."""
+    if name not in get_args(Storage):
+        raise InputError(f"storage should be float32, float16 or compact, got {name!r}")
+    return cast(Storage, name)
+
+
 def save_octree(
     path: str | os.PathLike[str], octree: Octree, metadata: Mapping[str, Any], storage: Storage = "float32"
 ) -> int:
@@ -41,9 +48,10 @@ def save_octree(
     quantised and deflated to about a tenth (see nerfvol.octree.codec).
 
     Raises:
-        InputError: the path cannot be written, a value is not finite, or leaves that touch do not share their
+        InputError: no such storage, the path cannot be written, a value is not finite, or leaves that touch do not share their
             vertices (lod.cut, lod.at_level): a file says where leaves are, and their vertices follow from that.
     """
+    storage = storage_of(storage)
     corners, n_vertices = number_corners(octree.leaf_level, octree.leaf_ijk)
     if n_vertices != octree.n_vertices or not np.array_equal(corners, octree.corners):
         raise InputError(
@@ -74,12 +82,10 @@ def save_octree(
     if storage == "compact":
         planes, document["codec"] = codec.encode(density, sh)
         arrays.update(planes)
-    elif storage in ("float32", "float16"):
+    else:
         largest = np.finfo(storage).max
         arrays["density"] = np.clip(density, -largest, largest).astype(storage)
         arrays["sh"] = np.clip(sh, -largest, largest).astype(storage)
-    else:
-        raise ValueError(f"storage should be float32, float16 or compact, got {storage!r}")
     return write_arrays(path, arrays, document)
 
 

@@ -1,4 +1,4 @@
-"""Level of detail: what stands in for everything below an interior node, and the octree in which some nodes do.
+"""Level of detail: prefiltered nodes, each one cell for everything below it, and octrees cut at some of them.
 
 A view from afar, or a small picture, meets leaves smaller than a pixel; a node that is smaller than a pixel is then drawn
 in their place: a trilinear cell of the node's side with rows of its own (kernels/csrc/traverse.h). Level by level from
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from nerfvol.errors import InputError
 from nerfvol.native import aligned_empty, native
-from nerfvol.octree.rows import DENSITY_SLOT, Averages, explin, explin_inverse
+from nerfvol.octree.rows import DENSITY_SLOT, PrefilteredNodes, explin, explin_inverse
 from nerfvol.octree.topology import (
     LATTICE_OF_CORNER,
     LATTICE_WEIGHTS,
@@ -39,23 +39,23 @@ from nerfvol.octree.topology import (
 from nerfvol.octree.tree import Octree
 
 OPAQUE = 1 - 1e-6
-"""Averages are kept below this opacity, an optical thickness of 13.8: float32 has no numbers for more."""
+"""Prefiltered values are kept below this opacity, an optical thickness of 13.8: float32 has no numbers for more."""
 CLEAREST = 1e-12
-"""Averages are kept above this sigma / density_scale, whose logarithm is the raw density."""
+"""Prefiltered values are kept above this sigma / density_scale, whose logarithm is the raw density."""
 
 
-def node_averages(octree: Octree) -> Averages:
-    """The averages of every interior node, made when they are first asked for and kept with the octree.
+def prefiltered_nodes(octree: Octree) -> PrefilteredNodes:
+    """Values of every interior node, made when they are first asked for and kept with the octree.
 
-    They are made anew once values were assigned (``octree.values``, ``density`` or ``sh``) or trained. Writing into the
-    array ``octree.values`` is not noticed: set ``octree.averages`` to None then.
+    They are made again once values were assigned (``octree.values``, ``density`` or ``sh``) or trained. Writing into the
+    array ``octree.values`` is not noticed: set ``octree.prefiltered`` to None then.
     """
-    if octree.averages is None:
-        octree.averages = _average(octree)
-    return octree.averages
+    if octree.prefiltered is None:
+        octree.prefiltered = _prefilter(octree)
+    return octree.prefiltered
 
 
-def _average(octree: Octree) -> Averages:
+def _prefilter(octree: Octree) -> PrefilteredNodes:
     starts = level_starts(octree.node_mask)
     ijk = place_nodes(octree.node_mask, starts)
     sigma = (octree.density_scale * explin(octree.density)).astype(np.float32)
@@ -89,7 +89,7 @@ def _average(octree: Octree) -> Averages:
     np.concatenate(rows_of_level, out=values)
     first_row = np.cumsum([0, *map(len, rows_of_level)])
     corners = np.concatenate([c + np.int32(first) for c, first in zip(corners_of_level, first_row, strict=False)])
-    return Averages(corners, values)
+    return PrefilteredNodes(corners, values)
 
 
 def _optical_depth(depths: np.ndarray) -> np.ndarray:
@@ -138,9 +138,9 @@ def _restrict(
         sums[node] += _WEIGHTS[o] @ (part * weight[child][..., None])
 
 
-# ------------------------------------------------------------------ octrees in which nodes stand in
-def standing_in(octree: Octree, origin: ArrayLike, coarse: float) -> np.ndarray:
-    """The nodes that a view from ``origin`` (3,), scene units, does not open: (n_nodes,) bool.
+# ------------------------------------------------------------------ the LOD cut
+def lod_cut(octree: Octree, origin: ArrayLike, coarse: float) -> np.ndarray:
+    """The nodes that a view from ``origin`` (3,), scene units, draws in place of their leaves: (n_nodes,) bool.
 
     Those whose side is below ``coarse`` (radians) times the distance of their centre. The root is always opened.
     """
@@ -152,20 +152,20 @@ def standing_in(octree: Octree, origin: ArrayLike, coarse: float) -> np.ndarray:
     return small
 
 
-def may_stand_in(octree: Octree, origins: ArrayLike, coarse: float) -> bool:
-    """False where :func:`standing_in` surely holds for no node, seen from any of ``origins`` (n, 3)."""
+def has_lod_cut(octree: Octree, origins: ArrayLike, coarse: float) -> bool:
+    """False where :func:`lod_cut` surely has no node, seen from any of ``origins`` (n, 3)."""
     finest = octree.max_level - 1
     farthest = np.linalg.norm(np.asarray(origins) - (octree.origin + octree.size / 2), axis=-1).max(initial=0)
     return finest > 0 and octree.size / 2.0**finest < coarse * (farthest + octree.size * 3**0.5 / 2)
 
 
 def cut(octree: Octree, nodes: ArrayLike) -> Octree:
-    """The octree in which each of ``nodes`` (n_nodes,) bool, the root excepted, is a leaf and stands in for what is below.
+    """The octree in which each of ``nodes`` (n_nodes,) bool, the root excepted, is a leaf with its prefiltered values.
 
     A leaf and a node that touch share no vertex, since they hold different values there.
     """
     closes = np.asarray(nodes, bool)
-    averages = node_averages(octree)
+    prefiltered = prefiltered_nodes(octree)
     starts = level_starts(octree.node_mask)
     parent = np.repeat(np.arange(octree.n_nodes), POPCOUNT[octree.node_mask])  # of nodes 1, 2, ...
     opened = np.ones(octree.n_nodes, bool)
@@ -176,17 +176,17 @@ def cut(octree: Octree, nodes: ArrayLike) -> Octree:
     level = np.searchsorted(starts, closed, side="right") - 1
     level = np.concatenate([octree.leaf_level[whole], level])
     ijk = np.concatenate([octree.leaf_ijk[whole], place_nodes(octree.node_mask, starts)[closed]])
-    corners = np.concatenate([octree.corners[whole], averages.corners[closed] + np.int32(octree.n_vertices)])
+    corners = np.concatenate([octree.corners[whole], prefiltered.corners[closed] + np.int32(octree.n_vertices)])
     order = np.lexsort((morton(ijk), level)).astype(np.int32)
     new = Octree.from_leaves(level, ijk, octree.origin, octree.size, octree.sh_degree, octree.density_scale)
-    n_rows = octree.n_vertices + len(averages.values)
+    n_rows = octree.n_vertices + len(prefiltered.values)
     new.corners, new._n_vertices = renumber_corners(np.ascontiguousarray(corners), order, n_rows)
     source = np.empty(new.n_vertices, np.int64)
     source[new.corners] = corners[order]
     new.values = np.where(
         (source < octree.n_vertices)[:, None],
         octree.values[np.minimum(source, octree.n_vertices - 1)],
-        averages.values[np.maximum(source - octree.n_vertices, 0)],
+        prefiltered.values[np.maximum(source - octree.n_vertices, 0)],
     )
     return new
 
@@ -200,7 +200,7 @@ def at_level(octree: Octree, level: int) -> Octree:
 def simplified(octree: Octree, level: int) -> Octree:
     """The octree of :func:`at_level` with shared vertices, as every proper octree has them: it can be saved and trained.
 
-    Where leaves and nodes that touch hold different values, their vertex has the mean that the averages have (see the
+    Where leaves and nodes that touch hold different values, their vertex has the mean that prefiltered nodes have (see the
     module's head): of the opacities over the side of a cell of ``level``, and of the colours weighted by these. Other
     vertices keep their rows bit by bit. Raises InputError for a level below 1.
     """

@@ -17,6 +17,11 @@ BLOCKS = {0: 1, 1: 1, 2: 2, 3: 4}
 DENSITY_SLOT = 12
 
 
+DENSITY_SCALE = 300.0
+"""Coefficient that a raw density of 1 means where training begins, per edge of the inner cube: leaves of 1/300 of it are then
+opaque to 63 %."""
+
+
 def explin(raw: np.ndarray) -> np.ndarray:
     """exp(raw - 1) below 1, raw above: positive, with a bounded slope [SVRaster]. Any shape."""
     return np.where(raw < 1, np.exp(np.minimum(raw, 1) - 1), raw)
@@ -28,7 +33,7 @@ def explin_inverse(value: np.ndarray) -> np.ndarray:
 
 
 def sh_slots(degree: int) -> np.ndarray:
-    """Where coefficient k of channel c stands in a vertex row: (3, (degree + 1)**2) int. Density stands at slot 12.
+    """Where coefficient k of channel c is stored in a vertex row: (3, (degree + 1)**2) int. Density is at slot 12.
 
     Rows are blocks of 16: four coefficients of red, four of green, four of blue, four spare places (the first block's
     hold the density, the second's the ninth coefficients of degree 2).
@@ -50,8 +55,11 @@ def convert_rows(rows: np.ndarray, old_degree: int, new_degree: int) -> np.ndarr
 
 
 @dataclass(frozen=True)
-class Averages:
-    """corners: (n_nodes, 8) int32, rows of ``values`` (n, row) float32, packed like those of the octree's vertices."""
+class PrefilteredNodes:
+    """What interior nodes are drawn with: corners (n_nodes, 8) int32, rows of values (n, row) float32.
+
+    The rows are packed like those of the octree's vertices.
+    """
 
     corners: np.ndarray
     values: np.ndarray

@@ -5,10 +5,10 @@ Conventions, once for the whole module:
 - The root cube has its smallest corner at ``origin`` (scene units) and side ``size``. A cell of level l has side
   ``size / 2**l`` and integer position ``ijk`` in units of that side.
 - Octant o of a node lies at offsets ``(o >> 2 & 1, o >> 1 & 1, o & 1)`` along x, y, z; corners of a leaf likewise.
-- Interior nodes stand in breadth-first order, by Morton code within a level. Two bits per child say what it is:
-  ``node_mask`` an interior node, ``leaf_mask`` a leaf, neither: empty space. Where the children stand follows from
+- Interior nodes are stored in breadth-first order, by Morton code within a level. Two bits per child say what it is:
+  ``node_mask`` an interior node, ``leaf_mask`` a leaf, neither: empty space. Where the children are follows from
   counting bits, so there are no links that could be wrong.
-- Leaves stand in the order in which the nodes name them: by level, then by Morton code.
+- Leaves are stored in the order in which the nodes name them: by level, then by Morton code.
 - The field is trilinear inside a leaf between values at its eight corners, shared by all leaves that have that corner
   (a finer leaf's corner on the face of a coarser one belongs to the finer leaf alone).
 - sigma = density_scale * explin(raw density); colour = 1/2 + sum_k sh_k Y_k(d), not clamped inside the integral.
@@ -43,7 +43,7 @@ from nerfvol.octree.topology import (
 )
 
 if TYPE_CHECKING:
-    from nerfvol.octree.rows import Averages
+    from nerfvol.octree.rows import PrefilteredNodes
 
 
 class Octree:
@@ -52,11 +52,11 @@ class Octree:
     Attributes: origin (3,) float64; size, density_scale float; sh_degree 0-3; node_mask, leaf_mask (n_nodes,) uint8;
     first_node, first_leaf (n_nodes,) int32; leaf_level (n_leaves,) int8; leaf_ijk (n_leaves, 3) int32;
     corners (n_leaves, 8) int32; values (n_vertices, 16 * blocks) float32, packed rows. The last two begin on a cache
-    line; values that do not are copied when they are assigned. averages: what nerfvol.lod made of the values, or
+    line; values that do not are copied when they are assigned. prefiltered: what octree.lod made of the values, or
     None; assigning values, density or sh drops it, and whoever writes into ``values`` sets it to None.
     """
 
-    averages: Averages | None = None
+    prefiltered: PrefilteredNodes | None = None
 
     def __init__(
         self, node_mask: ArrayLike, leaf_mask: ArrayLike, *, origin: ArrayLike, size: float, sh_degree: int,
@@ -145,7 +145,7 @@ class Octree:
     @values.setter
     def values(self, rows: ArrayLike) -> None:
         self._values = aligned(np.asarray(rows), np.float32)
-        self.averages = None
+        self.prefiltered = None
 
     @property
     def density(self) -> np.ndarray:
@@ -155,7 +155,7 @@ class Octree:
     @density.setter
     def density(self, raw: ArrayLike) -> None:
         self.values[:, DENSITY_SLOT] = raw
-        self.averages = None
+        self.prefiltered = None
 
     @property
     def sh(self) -> np.ndarray:
@@ -165,7 +165,7 @@ class Octree:
     @sh.setter
     def sh(self, coefficients: ArrayLike) -> None:
         self.values[:, sh_slots(self.sh_degree)] = coefficients
-        self.averages = None
+        self.prefiltered = None
 
     def with_sh_degree(self, degree: int) -> Octree:
         """The same field with another SH degree: missing bands are zero, surplus ones are dropped."""

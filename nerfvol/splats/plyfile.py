@@ -8,7 +8,7 @@ lists in the vertices themselves are refused, other elements only if they come b
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -181,15 +181,21 @@ class PlyFile:
         return out
 
 
-def write_ply(path: str | os.PathLike[str], comments: Sequence[str], columns: dict[str, NDArray[np.float32]]) -> int:
-    """Write float32 ``columns`` (n,) as the vertices of a binary little-endian PLY, atomically; returns its bytes."""
+def write_ply(path: str | os.PathLike[str], comments: Sequence[str], columns: Mapping[str, NDArray]) -> int:
+    """Write ``columns`` (n,), bytes as they are and all others as float32, as the vertices of a binary little-endian PLY,
+    atomically; returns its bytes."""
     n = len(next(iter(columns.values())))
+    row = np.dtype([(name, "u1" if c.dtype == np.uint8 else "<f4") for name, c in columns.items()])
+    kinds = {name: "uchar" if c.dtype == np.uint8 else "float" for name, c in columns.items()}
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    lines += [f"element vertex {n}", *(f"property float {name}" for name in columns), "end_header", ""]
+    lines += [f"element vertex {n}", *(f"property {kind} {name}" for name, kind in kinds.items()), "end_header", ""]
     header = "\n".join(lines).encode("ascii")
-    run = max(1, _RUN // (4 * len(columns)))
+    run = max(1, _RUN // row.itemsize)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(header)
         for at in range(0, n, run):
-            file.write(np.stack([c[at : at + run] for c in columns.values()], axis=1).astype("<f4").tobytes())
-    return len(header) + 4 * n * len(columns)
+            rows = np.empty(min(run, n - at), row)
+            for name, column in columns.items():
+                rows[name] = column[at : at + run]
+            file.write(rows.tobytes())
+    return len(header) + n * row.itemsize

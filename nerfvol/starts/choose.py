@@ -17,7 +17,7 @@ from nerfvol.starts.random import random_points
 from nerfvol.starts.subject import Subject, subject_of
 
 FEW_POINTS = 4_000
-"""A model with fewer points gets those of a plane sweep beside them."""
+"""A model with fewer points gets those of a plane sweep next to them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
 
     Objects on a transparent background begin from random points in their box; photographs from the points of their COLMAP
     model, else from a plane sweep; a model of fewer than 4,000 points gets the sweep's as well. Where a sweep finds
-    nothing, what there is of a model or random points stand in. ``name``: "points", "sweep", "points+sweep" or "random".
+    nothing, what there is of a model, or random points, are used. ``name``: "points", "sweep", "points+sweep" or "random".
 
     Raises:
         InputError: an unknown name, or what is asked for by name finds nothing.
@@ -50,7 +50,7 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
         raise InputError(f"the start {name!r} cannot be used: {found}")
     if not len(cloud):
         cloud = random_points(dataset.scene, seed=seed)
-        chosen, found = "random", f"{found}; {len(cloud)} random points in the scene's box stand in: expect little"
+        chosen, found = "random", f"{found}; {len(cloud)} random points in the scene's box instead: expect little"
     return Start(cloud, subject, chosen, f"start: {found} ({why})")
 
 

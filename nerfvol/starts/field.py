@@ -1,8 +1,8 @@
 """Distillation: a radiance field becomes a sparse octree of several leaf sizes, and what that costs is measured.
 
 1. Candidates: the field is looked at in coarse cells; only cells that hold something, and their neighbours, are looked
-   at again at half the size, down to the finest level (outside the region of detail: the coarser the farther out).
-2. Values: coefficient and spherical harmonics at the leaves' vertices, averaged over the vertex's surroundings.
+   at again at half the size, down to the finest level (outside the inner cube: the coarser the farther out).
+2. Values: coefficient and spherical harmonics at the leaves' vertices, averaged around the vertex.
 3. Merging: eight leaves whose values the parent's own corners reproduce become one. Done before pruning, so that thin
    haze is judged by large leaves, in which it has weight.
 4. Visibility: the training rays are rendered, and leaves no ray needs are removed [PlenOctrees, section 4].
@@ -30,11 +30,17 @@ from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
 from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.octree.merge import merge_smooth
-from nerfvol.octree.rows import EMPTY_DENSITY, explin_inverse
+from nerfvol.octree.rows import DENSITY_SCALE, EMPTY_DENSITY, explin_inverse
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
 from nerfvol.views import OctreeModel
 
+COMPARED_VIEWS = 2
+"""Training views on which field and octree are compared."""
+JUDGED_PIXELS = 200
+"""Along the longer side of an image: what visibility and comparison need is seen in so many; ..."""
+JUDGED_DOWNSCALE = 4
+"""... but larger images are averaged by no more than this, lest what is thin goes unseen."""
 _CHUNK = 32768  # points of one evaluation of the field
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
 
@@ -96,15 +102,15 @@ def distill(
     level, ijk = level[kept], ijk[kept]
     return_free_memory()
     octree = Octree.from_leaves(
-        level, ijk, frame.origin.tolist(), frame.size, config.sh_degree, config.density_scale / (2 * domain.half)
+        level, ijk, frame.origin.tolist(), frame.size, cast(int, config.sh_degree), DENSITY_SCALE / (2 * domain.half)
     )
-    write_values(octree, field, config.samples_per_vertex)
+    write_values(octree, field)
     candidates = octree.n_leaves
     octree = merge_smooth(octree, config.coarse_level, config.merge_tolerance)
     merged = octree.n_leaves
     return_free_memory()
     if config.prune_weight > 0:
-        weights = largest_weights(octree, dataset, background, config.visibility_downscale)
+        weights = largest_weights(octree, dataset, background, judged_downscale(dataset))
         keep = weights >= config.prune_weight
         if not keep.any():
             raise InputError(
@@ -114,7 +120,7 @@ def distill(
     return_free_memory()
     field_psnr = octree_psnr = math.nan
     if render_field is not None:
-        few = dataset.evenly(config.compare_views).smaller(config.compare_downscale, background)
+        few = dataset.evenly(COMPARED_VIEWS).smaller(judged_downscale(dataset), background)
         field_psnr = score_views(render_field, few, background)["psnr"]
         octree_psnr = evaluate(OctreeModel(octree), few, background)["psnr"]
     levels, counts = np.unique(octree.leaf_level, return_counts=True)
@@ -127,11 +133,17 @@ def distill(
     return octree, report
 
 
+def judged_downscale(dataset: Dataset) -> int:
+    """The factor by which images are averaged before leaves are judged by them: about JUDGED_PIXELS are left."""
+    longest = max(max(c.intrinsics.width, c.intrinsics.height) for c in dataset.cameras)
+    return min(JUDGED_DOWNSCALE, max(1, longest // JUDGED_PIXELS))
+
+
 @dataclasses.dataclass(frozen=True)
 class Frame:
     """The octree's root cube, and how fine it is where.
 
-    origin (3,), size: the root cube. finest: the level of leaves in the detail cube. center, half: the detail cube.
+    origin (3,), size: the root cube. finest: the level of leaves in the inner cube. center, half: the inner cube.
     """
 
     origin: np.ndarray
@@ -142,7 +154,7 @@ class Frame:
 
     @classmethod
     def of(cls, domain: Domain, level: int) -> Frame:
-        """The detail cube itself, or the smallest power-of-two multiple of it that holds the background."""
+        """The inner cube itself, or the smallest power-of-two multiple of it that holds the background."""
         doublings = max(0, math.ceil(math.log2(domain.outer) - 1e-6))
         center, size = np.array(domain.center), 2 * domain.half * 2.0**doublings
         return cls(center - size / 2, size, level + doublings, center, domain.half)
@@ -152,7 +164,7 @@ class Frame:
         edge = self.size / 2**level
         low = self.origin + ijk * edge - self.center
         nearest = np.maximum(np.maximum(low, -(low + edge)), 0).max(1)  # Chebyshev distance of the cell's nearest point
-        # Shell k holds distances from 2**(k - 1) to 2**k; the detail cube itself is 0.
+        # Shell k holds distances from 2**(k - 1) to 2**k; the inner cube itself is 0.
         shells = np.where(
             nearest < self.half * (1 - 1e-9), 0, np.floor(np.log2(np.maximum(nearest / self.half, 1)) + 1e-9) + 1
         )
@@ -184,7 +196,7 @@ def candidate_cells(
             threshold *= 2
     if level < cast(int, config.level):
         messages.append(
-            f"the field is hazy: with leaves smaller than 1/{1 << level} of the region of detail it would not fit into "
+            f"the field is hazy: with leaves smaller than 1/{1 << level} of the inner cube it would not fit into "
             f"{config.max_leaves:,} leaves"
         )
     if threshold > -math.log1p(-config.empty_opacity):

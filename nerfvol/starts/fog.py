@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.octree.rows import DENSITY_SCALE
 from nerfvol.octree.tree import Octree
 
 
-def thin_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
-    """A nearly transparent octree: 2**level cells along the detail cube, then shells of doubling cells to the horizon.
+def low_density_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
+    """A nearly transparent octree: 2**level cells along the inner cube, then shells of doubling cells to the horizon.
 
     Each shell reaches twice as far as the one inside it with cells twice as large, so that cells look about equally
     large from the middle. Right before the lenses there is nothing (Dataset.before_a_lens).
@@ -29,4 +30,4 @@ def thin_octree(dataset: Dataset, level: int, sh_degree: int) -> Octree:
     levels, cells = np.concatenate(levels), np.concatenate(cells)
     kept = ~dataset.before_a_lens(origin + (cells + 0.5) * (size / 2.0**levels)[:, None])
     levels, cells = levels[kept], cells[kept]
-    return Octree.from_leaves(levels, cells, origin, size, sh_degree, density_scale=300 / detail)
+    return Octree.from_leaves(levels, cells, origin, size, sh_degree, density_scale=DENSITY_SCALE / detail)

@@ -1,6 +1,6 @@
 """The points of a model with their colours: where structure from motion found the same spot in several photographs.
 
-nerfstudio's transforms.json names a PLY file of them (``ply_file_path``). COLMAP's are read from beside the poses,
+nerfstudio's transforms.json names a PLY file of them (``ply_file_path``). COLMAP's are read from next to the poses,
 ``points3D.bin`` or ``points3D.txt`` (COLMAP documentation, "Output Format"): id, x y z, r g b, reprojection error in pixels,
 and the track, the observations that a point was found by.
 """

@@ -138,7 +138,8 @@ def depth_maps(views: Sequence[SweepView], near: float, far: float) -> list[Dept
         for score, rival in zip(outputs[1], outputs[2], strict=True)
     ]
     agreed = [_agreeing(cameras, chosen, k, outputs[0], sure) for k in range(len(chosen))]
-    return [DepthMap(int(i), *row) for i, *row in zip(chosen, outputs[0], outputs[1], agreed, strict=True)]
+    found = zip(chosen, outputs[0], outputs[1], agreed, strict=True)
+    return [DepthMap(int(i), inverse_depth, score, confident) for i, inverse_depth, score, confident in found]
 
 
 def neighbours_of(cameras: Sequence[Camera], i: int, depth: float) -> NDArray[np.int64]:
@@ -185,8 +186,9 @@ def _apart(maps: NDArray[np.float64], others: NDArray[np.int64], step: float) ->
     # The plane at infinity maps a pixel with homogeneous weight 1 for cameras that look the same way; the shift is about b.
     shift = np.hypot(maps[..., 9], maps[..., 10]) * step
     shift = np.where(others >= 0, shift, np.nan)
-    known = (others >= 0).any(axis=1)
-    middle = np.array([np.nanmedian(row) if have else 1.0 for row, have in zip(shift, known, strict=True)])
+    middle = np.array(
+        [np.nanmedian(row) if (views >= 0).any() else 1.0 for row, views in zip(shift, others, strict=True)]
+    )
     return np.clip(np.ceil(RIVAL / np.maximum(middle, 1e-12)), 2, PLANES // 2).astype(np.int32)
 
 
@@ -196,7 +198,7 @@ def _agreeing(
     """Which pixels of reference k are sure, and where a sure pixel of another reference has their inverse depth to 4.5 %."""
     here = cameras[chosen[k]]
     centres = np.stack([cameras[j].position for j in chosen])
-    order = np.argsort(np.linalg.norm(centres - here.position, axis=1), kind="stable")
+    order = [int(j) for j in np.argsort(np.linalg.norm(centres - here.position, axis=1), kind="stable")]
     facing = [j for j in order if j != k and cameras[chosen[j]].forward @ here.forward > _WIDEST][:_MAPS]
     rows, columns = np.nonzero(sure[k])
     pixel = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
@@ -231,7 +233,7 @@ def _points_of(view: SweepView, found: DepthMap, share: float, rng: np.random.Ge
     origin, directions = camera.rays_at(np.stack([columns + 0.5, rows + 0.5], axis=1))
     depth = 1 / found.inverse_depth.ravel()[source].astype(np.float64)
     positions = origin + directions * (depth / (directions @ camera.forward))[:, None]
-    return PointCloud(positions, view.image[rows, columns, :3].astype(np.float32) / 255)
+    return PointCloud(positions, np.divide(view.image[rows, columns, :3], 255, dtype=np.float32))
 
 
 def _nearest_pixels(known: NDArray[np.int64], asked: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.int64]:

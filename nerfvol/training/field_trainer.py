@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def domain_of(scene: SceneBounds) -> Domain:
-    """The cube of detail around the scene's bounds, and the background cube around it where there is one."""
+    """The inner cube around the scene's bounds, and the background cube around it where there is one."""
     aabb = np.asarray(scene.aabb, dtype=np.float64)
     center, half = aabb.mean(0), float((aabb[1] - aabb[0]).max() / 2)
     if not (math.isfinite(half) and half > 0):
@@ -41,6 +41,10 @@ def domain_of(scene: SceneBounds) -> Domain:
     return Domain(tuple(center.tolist()), half, outer)
 
 
+MOST_RAYS = 8192
+"""Of one step, while most of space is known to be empty."""
+NEAREST = 0.05
+"""Sample to a camera among photographs, in units of half the inner cube's edge."""
 FIELD_SHARE = 0.3
 """Of the time left in a run, the most that the field gets."""
 SECONDS_TO_DISTILL = 2.0
@@ -193,19 +197,24 @@ class FieldTrainer:
         self.schedules = [StepSchedule(self.domain, n) for n in config.march_steps]
         self.schedule = self.schedules[-1]
         self.optimizer = torch.optim.Adam(
-            self.field.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
+            self.field.parameters(), lr=config.rate, betas=(0.9, 0.99), eps=1e-15, fused=True
         )
         self.steps_done, self.stage = 0, 0  # an image scale is no stage: nothing else changes with it
-        self.n_rays = max(1, min(config.max_rays, config.samples_per_step // 64))
+        self.n_rays = max(1, min(MOST_RAYS, int(config.samples_per_step / (self._importance_samples or 64))))
         self._banks: dict[int, PixelBank] = {}
 
     # ------------------------------------------------------------------ what a run asks of a phase
     name = "field"
-    rates = "field.learning_rate"
+    rates = "field.rate"
     previews = (0.1, 0.4, 1.0)
     preview_width = 100  # a field renders slowly
     stages_left = 0
     most_steps = math.inf
+
+    @property
+    def _importance_samples(self) -> int:
+        """Of each ray with the importance sampler; 0 with the other, where they are as many as there is occupied space."""
+        return self.config.n_coarse + self.config.n_fine if self.config.sampler == "importance" else 0
 
     @property
     def steps(self) -> int:
@@ -246,7 +255,7 @@ class FieldTrainer:
     # ------------------------------------------------------------------ training
     def find_samples(self, rays_o: Tensor, rays_d: Tensor, generator: torch.Generator | None = None) -> Samples:
         """Where to look along rays; jittered with a generator, the middles without."""
-        near_plane = self.config.near_fraction * self.domain.half if self.domain.outer > 1 else 0.0
+        near_plane = NEAREST * self.domain.half if self.domain.outer > 1 else 0.0
         if self.config.sampler == "importance":
             near, far = intersect_aabb(rays_o, rays_d, self.domain.aabb)
             near = near.clamp(min=near_plane)
@@ -273,7 +282,7 @@ class FieldTrainer:
         config = self.config
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         generator = step_generator(self.seed, self.steps_done)
-        self._set_learning_rate(progress)
+        self._set_rate(progress)
         stage = self._stage_at(progress)
         bank, self.schedule = self._bank(stage), self.schedules[stage]
         rays_o, rays_d, target = bank.sample(self.n_rays, generator)
@@ -326,10 +335,10 @@ class FieldTrainer:
     def _follow_samples(self, n_samples: int) -> None:
         """Choose the next number of rays so that a step has about ``samples_per_step`` samples."""
         per_ray = n_samples / self.n_rays
-        if self.config.sampler == "importance":
-            per_ray = float(self.config.n_coarse + self.config.n_fine)
+        if self._importance_samples:
+            per_ray = float(self._importance_samples)
         wanted = self.config.samples_per_step / max(per_ray, 1.0)
-        self.n_rays = max(1, min(self.config.max_rays, int(min(wanted, 1.25 * self.n_rays + 16))))
+        self.n_rays = max(1, min(MOST_RAYS, int(min(wanted, 1.25 * self.n_rays + 16))))
 
     def _stage_at(self, progress: float) -> int:
         ends = self.config.stage_ends
@@ -341,11 +350,11 @@ class FieldTrainer:
             self._banks = {downscale: PixelBank(self.dataset, self.background.tolist(), downscale)}
         return self._banks[downscale]
 
-    def _set_learning_rate(self, progress: float) -> None:
+    def _set_rate(self, progress: float) -> None:
         warm = min(1.0, (self.steps_done + 1) / 20)
-        decay = self.config.final_learning_rate ** max(0.0, (progress - 1 / 3) * 1.5)
+        decay = self.config.rate_decay ** max(0.0, (progress - 1 / 3) * 1.5)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * warm * decay
+            group["lr"] = self.config.rate * warm * decay
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that lives between steps, as tensors and numbers."""

@@ -15,7 +15,7 @@ from nerfvol.config.splats import SplatConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs, estimate_bytes
-from nerfvol.datasets.tiles import rich_share
+from nerfvol.datasets.tiles import foreground_share
 from nerfvol.errors import InputError
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
@@ -25,21 +25,21 @@ from nerfvol.training.splat_schedule import Schedule
 
 BASE_BYTES = 160 << 20
 """The interpreter with numpy and Pillow (45 MiB resident), the kernels' records of a step, and what the allocator keeps: what
-runs have at their peak beside the arrays named below."""
+runs have at their peak next to the arrays named below."""
 FIELD_BYTES = 310 << 20
 """torch, the code that it compiles and what the training of a field leaves behind: measured."""
 DISTILL_BYTES = 290 << 20
-"""Beside the field and the images: an octree of candidates before and after leaves were merged (0.9 million for lego)."""
+"""Next to the field and the images: an octree of candidates before and after leaves were merged (0.9 million for lego)."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
-"""Per vertex: a slot (int32), beside two rows of floats."""
+"""Per vertex: a slot (int32), next to two rows of floats."""
 VERTICES_PER_LEAF = 1.65
 """Vertices of an octree that was split where it pays, for each leaf: measured on lego, 1.5 to 1.7 at every size."""
 BEFORE_SHARE = 0.4
 """Of the leaves of the largest octree: those that the octree before it had, which is in memory while its leaves are split."""
-RICH_BYTES_PER_PIXEL = 3
-"""Per training pixel in a tile that is not plain background: 8-bit RGB."""
+FOREGROUND_BYTES_PER_PIXEL = 3
+"""Per training pixel in a foreground tile: 8-bit RGB."""
 TILE_BYTES_PER_PIXEL = 0.33
 """Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool)."""
 LEAVES_PER_PIXEL = 2.2
@@ -54,21 +54,21 @@ SHARE = 0.9
 
 
 @dataclass(frozen=True)
-class Beside:
-    """What a run holds beside the octree and its training images.
+class OtherMemory:
+    """What a run holds besides the octree and its training images.
 
-    rich_share: of the training tiles, those that are not plain background. held_out_bytes: of images. field: whether the
+    foreground_share: of the training tiles, those of the foreground. held_out_bytes: of images. field: whether the
     octree comes from a field.
     """
 
-    rich_share: float = 1.0
+    foreground_share: float = 1.0
     held_out_bytes: int = 0
     field: bool = False
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes by use; ``leaves`` is the largest number of leaves that was reckoned with.
+    """Bytes by use; ``leaves`` is the largest number of leaves that was planned for.
 
     Images, octree and change are there at one time, the distillation of a field (0: there is none) at another.
     """
@@ -101,10 +101,11 @@ def octree_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> 
 
 
 def change_bytes(leaves: int, sh_degree: int, vertices: float | None = None) -> int:
-    """Bytes beside an octree that has just been split into so many leaves, while the second moments follow the values.
+    """Bytes needed next to an octree that has just been split into so many leaves, while the second moments follow the values.
 
     Of the octree before: second moments and corners; and where each leaf and vertex came from, 5 bytes each. Pruning the
-    largest octree would take a quarter more, but it has few leaves to lose, and then it is not done (finetune.WORTH_PRUNING).
+    largest octree would take a quarter more, but it has few leaves to lose, and then it is not done
+    (octree_trainer.WORTH_PRUNING).
     """
     count = VERTICES_PER_LEAF * leaves if vertices is None else vertices
     return int(BEFORE_SHARE * (row_bytes(sh_degree) * count + 32 * leaves) + 5 * (leaves + count))
@@ -116,26 +117,26 @@ def row_bytes(sh_degree: int) -> int:
 
 
 def estimate_training(
-    dataset: Dataset, leaves: int, sh_degree: int, beside: Beside | None = None, vertices: int | None = None
+    dataset: Dataset, leaves: int, sh_degree: int, other: OtherMemory | None = None, vertices: int | None = None
 ) -> MemoryEstimate:
     """What training an octree of at most ``leaves`` leaves on ``dataset`` takes.
 
-    ``vertices`` None: VERTICES_PER_LEAF, and an octree that is largest when the training images stand in tiles and their
-    files' pixels were let go; these count where they are more than what the octree still has to grow by, or cannot be let go.
-    With ``vertices`` the octree is there, and so are the images that it has beside it now.
+    ``vertices`` None: VERTICES_PER_LEAF, and an octree that is largest when the training images are in tiles and their
+    files' pixels were released; these count where they are more than what the octree still has to grow by, or
+    cannot be released. With ``vertices`` the octree is there, and so are the images that it has next to it now.
     """
-    beside = beside or Beside()
+    other = other or OtherMemory()
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
     octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
     growth = 0 if not dataset.can_reload or vertices is not None else change + octree // 2
-    tiles = int((TILE_BYTES_PER_PIXEL + RICH_BYTES_PER_PIXEL * beside.rich_share) * pixels)
+    tiles = int((TILE_BYTES_PER_PIXEL + FOREGROUND_BYTES_PER_PIXEL * other.foreground_share) * pixels)
     return MemoryEstimate(
-        base=BASE_BYTES + (FIELD_BYTES if beside.field else 0),
-        images=tiles + beside.held_out_bytes + max(0, dataset.nbytes - growth),
+        base=BASE_BYTES + (FIELD_BYTES if other.field else 0),
+        images=tiles + other.held_out_bytes + max(0, dataset.nbytes - growth),
         octree=octree,
         change=change,
         leaves=leaves,
-        distillation=dataset.nbytes + beside.held_out_bytes + DISTILL_BYTES if beside.field else 0,
+        distillation=dataset.nbytes + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
     )
 
 
@@ -150,27 +151,31 @@ def require_memory(estimate: MemoryEstimate, available: int | None = None) -> No
 
 
 def affordable_leaves(
-    dataset: Dataset, sh_degree: int, least: int = 1 << 18, available: int | None = None, beside: Beside | None = None
+    dataset: Dataset,
+    sh_degree: int,
+    least: int = 1 << 18,
+    available: int | None = None,
+    other: OtherMemory | None = None,
 ) -> int:
     """The most leaves with which training fits in the memory at hand; MOST_LEAVES where nobody tells how much that is.
 
     Raises:
-        InputError: not even ``least`` leaves fit beside the images.
+        InputError: not even ``least`` leaves fit next to the images.
     """
     free = available_memory() if available is None else available
     if free is None:
         return MOST_LEAVES
-    require_memory(estimate_training(dataset, least, sh_degree, beside), free)
+    require_memory(estimate_training(dataset, least, sh_degree, other), free)
     low, high = least, MOST_LEAVES
     while high - low > 1:
         middle = (low + high) // 2
-        fits = estimate_training(dataset, middle, sh_degree, beside).peak <= SHARE * free
+        fits = estimate_training(dataset, middle, sh_degree, other).peak <= SHARE * free
         low, high = (middle, high) if fits else (low, middle)
     return low
 
 
 def largest_octree(levels: Sequence[int], view_pixels: int, photographs: bool = False) -> int:
-    """Leaves to reckon with for stages whose finest levels are ``levels``, the first of which is full from the start.
+    """Leaves to plan for in stages whose finest levels are ``levels``, the first of which is full from the start.
 
     Splitting every leaf of a trained octree makes about 12 * 4^level. Since only leaves of more than a pixel are split,
     LEAVES_PER_PIXEL (or PHOTOGRAPH_LEAVES_PER_PIXEL) times the pixels of one view are a bound of their own.
@@ -196,7 +201,7 @@ def splits_within(split: np.ndarray, gain: np.ndarray, most: int | None) -> np.n
 
 
 SPLAT_BYTES = 3 * 4 + 84 + 6 * 81
-"""Per Gaussian, beside its parameters and moments: statistics, a record, and gradients of six tiles (mostly 4 to 8)."""
+"""Per Gaussian, next to its parameters and moments: statistics, a record, and gradients of six tiles (mostly 4 to 8)."""
 
 
 def splat_memory(photographs: Photographs, schedule: Schedule, config: SplatConfig, held_out_bytes: int) -> str:
@@ -219,26 +224,26 @@ def splat_memory(photographs: Photographs, schedule: Schedule, config: SplatConf
 
 
 class OctreePlan:
-    """How large the octree of a run may become, and what memory that takes beside everything else.
+    """How large the octree of a run may become, and what memory that takes next to everything else.
 
-    Attributes: max_leaves, a bound on splitting; rich_tiles, about so many training tiles are not plain background.
+    Attributes: max_leaves, a bound on splitting; foreground_tiles, about so many training tiles show more than the background.
     """
 
     def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int) -> None:
         """Raises InputError where not even a coarse octree fits in the memory at hand."""
         self._dataset, lens = dataset, dataset.cameras[0].intrinsics
-        share = rich_share(dataset, config.background)
+        share = foreground_share(dataset, config.background)
         pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
-        self.rich_tiles = max(share, 0.01) * pixels / TILE_RAYS
-        self._beside = Beside(share, held_out_bytes, field=config.init == "mlp")
+        self.foreground_tiles = max(share, 0.01) * pixels / TILE_RAYS
+        self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp")
         self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)
-        self.max_leaves = affordable_leaves(dataset, self._degree, least=min(wanted, 1 << 18), beside=self._beside)
+        self.max_leaves = affordable_leaves(dataset, self._degree, least=min(wanted, 1 << 18), other=self._other)
         self._announced = min(wanted, self.max_leaves)
 
     def sentence(self) -> str:
         """The estimate in words."""
-        return estimate_training(self._dataset, self._announced, self._degree, self._beside).sentence()
+        return estimate_training(self._dataset, self._announced, self._degree, self._other).sentence()
 
     def outgrown(self, octree: Octree) -> str | None:
         """A sentence where ``octree`` has more leaves than were announced: a surface has about so many, a thick medium
@@ -246,7 +251,7 @@ class OctreePlan:
         if octree.n_leaves <= self._announced:
             return None
         self._announced = octree.n_leaves
-        estimate = estimate_training(self._dataset, self._announced, self._degree, self._beside, octree.n_vertices)
+        estimate = estimate_training(self._dataset, self._announced, self._degree, self._other, octree.n_vertices)
         return f"memory: the octree outgrew the estimate; now {estimate.sentence()}"
 
 

@@ -1,8 +1,8 @@
 """Optimising the octree: stages from coarse to fine, pruning, subdivision where it pays.
 
 The recipe (docs/experiments.md has what each choice is worth): images from small to full size, an octree that starts
-thin and uniform, loses what no ray needs and splits what rays see at more than a pixel and holds most of the error;
-per-sample colour and distortion terms that empty space, smoothness that fades; RMSprop on touched vertices.
+nearly transparent and uniform, loses what no ray needs and splits what rays see at more than a pixel and holds most of
+the error; per-sample colour and distortion terms that empty space, total variation that fades; RMSprop on touched vertices.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import OctreeConfig
+from nerfvol.config.training import OctreeConfig, SceneChoices
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.tiles import Cursor, TileBank
+from nerfvol.datasets.tiles import Cursors, TileBank
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
@@ -25,19 +25,31 @@ from nerfvol.octree.rows import convert_rows
 from nerfvol.octree.topology import Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
-from nerfvol.starts.fog import thin_octree
+from nerfvol.starts.fog import low_density_octree
 from nerfvol.training.memory import OctreePlan, splits_within
 from nerfvol.views import OctreeModel, render_image
 
-BEHIND = 2
-"""Stream of random numbers of the colours behind photographs; TileBank has 0 and 1."""
+BACKGROUND_STREAM = 2
+"""Stream of random numbers of the random background of photographs; TileBank has 0 and 1."""
 FEWEST_STEPS = 5000
 """Before a run with a time budget may end early, however few its tiles."""
 SECONDS_TO_WRITE = 0.5
-"""... and read an octree, beside ..."""
+"""... and read an octree, plus ..."""
 SECONDS_TO_WRITE_A_LEAF = 1.5e-6
 WORTH_PRUNING = 0.05
-"""Share of the leaves below which a pruning inside a stage is left out: two octrees stand in memory while one is made."""
+"""Share of the leaves below which a pruning inside a stage is left out: two octrees are in memory while one is made."""
+COVERAGE = 0.5
+"""Share of the foreground tiles that were seen before leaves are pruned, ..."""
+ENOUGH_TILES, ENOUGH_TILES_OF_PHOTOGRAPHS = 20_000, 80_000
+"""... and so many at most: around photographs much is seen at the rim of a few of them only, which takes more tiles to meet."""
+FINE_LEVEL = 9
+"""From this level on a stage splits leaves once, and ..."""
+FINE_STEPS = 2500
+"""... is left out where fewer steps would be left for it."""
+BETA = 0.98
+"""Memory, per step, of RMSprop's second moments."""
+FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
+"""At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
 FINAL_TILES = 4096
 """Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
 
@@ -62,19 +74,15 @@ class OctreeTrainer:
         octree: Octree | None = None,
         plan: OctreePlan | None = None,
     ):
-        config = config.for_scene(dataset.scene)
-        n = len(config.levels)
-        for name in ("downscales", "until", "tiles", "prunes"):
-            if len(getattr(config, name)) != n:
-                raise InputError(f"octree.{name} must have one entry per stage ({n}), got {len(getattr(config, name))}")
+        config, self.chosen = config.for_scene(dataset.scene), SceneChoices.of(config, dataset.scene)
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
-        self.octree = octree if octree is not None else self._thin_start()
+        self.octree = octree if octree is not None else self._low_density_start()
         self.state = ops.TrainState(self.octree)
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
         self.steps_done = 0
-        self.rich, self.plain = Cursor(), Cursor()
+        self.cursors = Cursors()
         self.prunings = 0
         self.tiles_seen = 0
         self.bank: TileBank | None = None
@@ -82,11 +90,11 @@ class OctreeTrainer:
         self.max_leaves = plan.max_leaves if plan else None
         """Bound on splitting, where memory is short; None: none."""
         self.steps = config.steps
-        drawn = config.tiles[-1] * (config.rich_share or 1.0)
-        self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.rich_tiles / drawn) if plan else math.inf
+        drawn = config.tiles[-1] * (config.foreground_share or 1.0)
+        self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.foreground_tiles / drawn) if plan else math.inf
 
-    def _thin_start(self) -> Octree:
-        return thin_octree(self.dataset, self.config.levels[0], self.config.sh_degree)
+    def _low_density_start(self) -> Octree:
+        return low_density_octree(self.dataset, self.config.levels[0], self.chosen.sh_degree)
 
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
@@ -129,7 +137,7 @@ class OctreeTrainer:
     @property
     def _start(self) -> float:
         """The share of the schedule that a given octree skips."""
-        return self.config.until[self.first_stage - 1] if self.first_stage else 0.0
+        return self.config.stage_ends[self.first_stage - 1] if self.first_stage else 0.0
 
     def state_dict(self) -> dict:
         """Everything an exact continuation needs: arrays, numbers and strings."""
@@ -140,7 +148,7 @@ class OctreeTrainer:
             "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
             "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
             "prunings": self.prunings, "tiles_seen": self.tiles_seen,
-            "rich": dataclasses.asdict(self.rich), "plain": dataclasses.asdict(self.plain),
+            "cursors": dataclasses.asdict(self.cursors),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
@@ -160,47 +168,49 @@ class OctreeTrainer:
             setattr(self.state, name, np.array(state[name], dtype=np.float32))
         for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
-        self.rich, self.plain = Cursor(**state["rich"]), Cursor(**state["plain"])
-        # The bank says when enough was seen to prune: where it stood before, it must stand at once.
+        self.cursors = Cursors.of(state["cursors"])
+        # The bank says when enough was seen to prune: where there was one, there must be one at once.
         self.bank = None if self.steps_done == 0 else self._make_bank()
 
     def step(self, progress: float) -> ops.StepReport:
         """One step at ``progress`` in [0, 1] of the run."""
         c = self.config
         progress = self._start + progress * (1 - self._start)
-        if progress >= c.until[self.stage] and self.stage + 1 < len(c.levels):
+        if progress >= c.stage_ends[self.stage] and self.stage + 1 < len(c.levels):
             if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
                 self.next_stage()
         self._prune_inside_stage(progress)
         if self.bank is None:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
-        smooth = fade if self.steps_done >= c.smooth_from else 0.0
+        smooth = fade if self.steps_done >= self.chosen.tv_from else 0.0
         options = ops.LossOptions(
-            background=self._behind(),
-            colour=c.colour * fade,
+            background=self._random_background(),
+            colour=c.colour_weight * fade,
             distortion=c.distortion * fade,
-            tv_density=c.smooth_density * smooth,
-            tv_sh=c.smooth_colour * smooth,
+            tv_density=self.chosen.tv_density * smooth,
+            tv_sh=self.chosen.tv_sh * smooth,
             early_stop_eps=c.early_stop_eps,
         )
-        late = max(0.0, progress - c.decay_from) / (1 - c.decay_from)
-        rate = c.rate_decay**late
-        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=c.beta)
-        batch = self.bank.draw(c.tiles[self.stage], c.rich_share, self.seed, self.rich, self.plain)
+        late = max(0.0, progress - self.chosen.decay_from) / (1 - self.chosen.decay_from)
+        rate = self.chosen.rate_decay**late
+        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=BETA)
+        batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
         self.steps_done += 1
         self.tiles_seen += c.tiles[self.stage]
         return report
 
-    def _behind(self) -> tuple[float, ...]:
-        """What this step's rays see where they leave the octree: the background.
+    def _random_background(self) -> tuple[float, ...]:
+        """What this step's rays see where they leave the octree: the background of objects.
 
         In photographs another colour each step, for they have none, and nothing in them may rely on one.
         """
         if not self.dataset.scene.is_unbounded:
             return self.background
-        random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, BEHIND, self.steps_done])))
+        random = np.random.Generator(
+            np.random.Philox(np.random.SeedSequence([self.seed, BACKGROUND_STREAM, self.steps_done]))
+        )
         return tuple(random.random(3).tolist())
 
     def _make_bank(self) -> TileBank:
@@ -212,9 +222,9 @@ class OctreeTrainer:
         old, self.stage, self.prunings = self.stage, self.stage + 1, 0
         error, footprint = self.prune()
         footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
-        fine = c.levels[self.stage] >= c.fine_from
+        fine = c.levels[self.stage] >= FINE_LEVEL
         for _ in range(1 if fine else c.levels[self.stage]):
-            transfer = self._split(error, footprint, c.subdivide_error if fine else c.coarse_error)
+            transfer = self._split(error, footprint, c.subdivide_error if fine else self.chosen.coarse_error)
             if transfer is None:
                 break
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
@@ -222,7 +232,7 @@ class OctreeTrainer:
             self._grow_sh(c.final_sh_degree)
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
-            self.rich, self.plain = Cursor(), Cursor()
+            self.cursors = Cursors()
 
     def _split(self, error: np.ndarray, footprint: np.ndarray, share: float) -> Transfer | None:
         """Splits the leaves that this stage wants finer, among those that hold ``share`` of the error; None: there are none.
@@ -230,7 +240,7 @@ class OctreeTrainer:
         error, footprint (in pixels of this stage's images): (n_leaves,).
         """
         c, level = self.config, self.config.levels[self.stage]
-        split = footprint > (c.subdivide_pixels if level >= c.fine_from else c.whole_pixels)
+        split = footprint > (c.subdivide_pixels if level >= FINE_LEVEL else c.whole_pixels)
         split &= self.octree.leaf_level < self.dataset.scene.finest_levels(self.octree.leaf_centers(), level)
         split &= holds_share(error, share)
         split = splits_within(split, error, self.max_leaves)
@@ -246,45 +256,46 @@ class OctreeTrainer:
         """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
         c, stage = self.config, self.stage + 1
         left = self.steps_done * (1 - progress) / max(progress - self._start, 1e-9)
-        return left >= (c.fine_steps if c.levels[stage] >= c.fine_from else c.prunes[stage] * c.prune_steps)
+        return left >= (FINE_STEPS if c.levels[stage] >= FINE_LEVEL else c.prunes[stage] * c.prune_steps)
 
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
-        # Around photographs much is seen at the rim of a few of them only: it takes more tiles to have met it at all.
-        enough = 20_000 if not self.dataset.scene.is_unbounded else 80_000
+        enough = ENOUGH_TILES_OF_PHOTOGRAPHS if self.dataset.scene.is_unbounded else ENOUGH_TILES
         if self.bank is None or self.tiles_seen < self.config.prune_steps * self.config.tiles[self.stage]:
             return False
-        return self.tiles_seen >= min(self.config.coverage * len(self.bank.rich_tiles), enough)
+        return self.tiles_seen >= min(COVERAGE * len(self.bank.foreground_tiles), enough)
 
     def _prune_inside_stage(self, progress: float) -> None:
         """Prunes where it is due, and splits where that pays."""
         c = self.config
-        start = c.until[self.stage - 1] if self.stage else 0.0
+        start = c.stage_ends[self.stage - 1] if self.stage else 0.0
         due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
         if (
             self.prunings < c.prunes[self.stage]
-            and progress >= start + due * (c.until[self.stage] - start)
+            and progress >= start + due * (c.stage_ends[self.stage] - start)
             and self._seen_enough()
         ):
             error, footprint = self.state.error, self.state.footprint
             if 1 - self._needed(c.prune_weight).mean() >= WORTH_PRUNING:
                 error, footprint = self.prune()
-            if not c.growing_error or self._split(error, footprint, c.growing_error) is None:
-                self._start_anew()
+            if not self.chosen.growing_error or self._split(error, footprint, self.chosen.growing_error) is None:
+                self._forget_statistics()
             self.prunings += 1
 
     def _needed(self, weight: float) -> np.ndarray:
         """Which leaves have a largest weight of at least ``weight``, (n_leaves,).
 
-        And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what stands at the
+        And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what is seen at the
         rim of a few pictures would be lost for good. They cost no time, and are split no more.
         """
         needed = self.state.max_weight >= weight
-        if self.bank is not None and self.config.rich_share * self.tiles_seen < 2 * len(self.bank.rich_tiles):
+        if self.bank is not None and self.config.foreground_share * self.tiles_seen < 2 * len(
+            self.bank.foreground_tiles
+        ):
             needed |= self.state.footprint == 0
         return needed
 
-    def _start_anew(self) -> None:
+    def _forget_statistics(self) -> None:
         """Forgets what rays needed so far."""
         self.tiles_seen = 0
         self.state.reset_statistics(self.octree.n_leaves)
@@ -296,24 +307,24 @@ class OctreeTrainer:
             raise InputError(
                 f"the octree collapsed to empty space at step {self.steps_done}: no training ray needs any of it; check "
                 "that --background is the images' background and that the scene bounds contain the object, or lower "
-                "octree.colour and octree.distortion"
+                "octree.colour_weight and octree.distortion"
             )
         error, footprint = self.state.error[keep], self.state.footprint[keep]
         self._change(*self.octree.prune(keep))
         return error, footprint
 
     def finish(self) -> Octree:
-        """The octree without the leaves that no picture misses: see ``final_prune_weights``. Ends the training.
+        """The octree without the leaves that no picture misses: see FINAL_PRUNE_WEIGHTS. Ends the training.
 
-        A second octree stands beside the first while they are compared; moments and tiles are let go before.
+        A second octree is in memory while they are compared; moments and tiles are released before.
         """
         if self.bank is None or not self._seen_enough():
             return self.octree
         rng = np.random.default_rng(self.seed)
-        tiles = self.bank.rich_tiles if len(self.bank.rich_tiles) else self.bank.plain_tiles
+        tiles = self.bank.foreground_tiles if len(self.bank.foreground_tiles) else self.bank.background_tiles
         tiles = rng.choice(tiles, min(len(tiles), FINAL_TILES), replace=False)
         batch = self.bank.batch(tiles, np.ones(len(tiles), np.float32))
-        needed = [self._needed(weight) for weight in self.config.final_prune_weights]
+        needed = [self._needed(weight) for weight in FINAL_PRUNE_WEIGHTS]
         self.bank = None
         del self.state, tiles
         return_free_memory()

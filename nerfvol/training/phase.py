@@ -20,14 +20,26 @@ class Phase(Protocol):
     ``preview_width`` pixels is written.
     """
 
-    name: str
-    rates: str
-    steps: int
-    most_steps: float
-    previews: Sequence[float]
-    preview_width: int
     steps_done: int
     stage: int
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def rates(self) -> str: ...
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def most_steps(self) -> float: ...
+
+    @property
+    def previews(self) -> Sequence[float]: ...
+
+    @property
+    def preview_width(self) -> int: ...
 
     @property
     def stages_left(self) -> int:
@@ -62,14 +74,18 @@ class Phase(Protocol):
         """A sentence where the representation needs more memory than was announced."""
         ...
 
-    def take_model(self, metadata: dict[str, Any]) -> Model:
-        """The finished model; everything else is released."""
-        ...
-
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs: arrays, numbers and strings."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from ``state``; InputError, LookupError, TypeError or ValueError where it does not fit."""
+        ...
+
+
+class FinalPhase(Phase, Protocol):
+    """A phase whose product is the run's: the last one."""
+
+    def take_model(self, metadata: dict[str, Any]) -> Model:
+        """The finished model; everything else is released."""
         ...

@@ -111,7 +111,7 @@ class Data:
 
     @property
     def held_out_bytes(self) -> int:
-        """Bytes of the images that stay in memory beside the training images."""
+        """Bytes of the images that stay in memory next to the training images."""
         return self.held_out.nbytes or self.first.nbytes + self.compared.nbytes
 
 

@@ -212,10 +212,10 @@ class Run:
             self.data.training.release()
 
     def preview(self, phase: Phase, moment: float) -> None:
-        """The first held-out view, small: truth beside what the phase has."""
+        """The first held-out view, small: truth next to what the phase has."""
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
-        truth = composite_average(image, self.config.background, k).astype(np.float32) / 255
+        truth = np.divide(composite_average(image, self.config.background, k), 255, dtype=np.float32)
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
         pictures.write_png(self.folder / run_folder.PREVIEWS / f"{phase.name}_{round(100 * moment):03d}.png", picture)
 

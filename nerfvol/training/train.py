@@ -20,7 +20,7 @@ from typing import Any
 from tqdm import tqdm
 
 from nerfvol import __version__
-from nerfvol.config.training import Config
+from nerfvol.config.training import FINEST_LEVEL, Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
@@ -32,7 +32,7 @@ from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
 from nerfvol.training.memory import OctreePlan, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
-from nerfvol.training.phase import Phase
+from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.prepare import check_folder, load_data
 from nerfvol.training.session import Clock, Run, Say, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
@@ -86,9 +86,9 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
     data = load_data(config, say)
     run = Run(config, data, clock, saved, say)
     with run.interruptible(), run:
-        phase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
+        phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
         optimise(run, phase)
-        trained = [phase.take_model(run.metadata())]
+        trained: list[Model] = [phase.take_model(run.metadata())]
         del phase
         return finish(run, trained)
 
@@ -130,7 +130,7 @@ def announce(run: Run, memory: str) -> None:
 
 # ------------------------------------------------------------------ the loop
 def optimise(run: Run, phase: Phase) -> None:
-    """Steps until the phase is over, with all that goes on beside them."""
+    """Steps until the phase is over, with all that goes on around them."""
     run.enter(phase)
     progress = run.progress(phase)
     with progress_bar(phase.name, progress) as bar:
@@ -170,9 +170,7 @@ def start_from_field(run: Run) -> Octree:
     run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
                             "MB": field.parameter_bytes / 1e6}  # fmt: skip
     settings = dataclasses.replace(
-        config.distill,
-        level=min(config.distill.level or 16, max(config.octree.levels)),
-        sh_degree=config.octree.sh_degree,
+        config.distill, level=min(config.distill.level or FINEST_LEVEL, max(config.octree.levels))
     )
     started = time.perf_counter()
     octree, report = distill(field.trained_field(), field.domain, data.training, background, settings, field.picture)

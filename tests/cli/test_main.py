@@ -49,6 +49,12 @@ def test_help_imports_nothing_heavy(arguments):
     assert not HEAVY & imported_by(f"from nerfvol.cli import main\nmain.main({arguments!r})")
 
 
+def test_a_mistake_is_told_without_the_synthetic_scenes():
+    """Their compiler takes a second to load, and they did not raise it."""
+    mistake = "from nerfvol.cli import main\nassert main.main(['info', 'no-such-run']) == 2"
+    assert not {"data_synth", "numba", "torch"} & imported_by(mistake)
+
+
 def test_help_names_every_command():
     done = run("--help")
     assert done.returncode == 0
@@ -204,7 +210,7 @@ octree:
   steps: 300
   levels: [4, 5, 5]
   downscales: [2, 1, 1]
-  until: [0.2, 0.5, 1.0]
+  stage_ends: [0.2, 0.5, 1.0]
   tiles: [16, 16, 16]
   prunes: [1, 1, 1]
 """

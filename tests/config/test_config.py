@@ -1,34 +1,59 @@
 """Settings: layering, one clear sentence for every bad key and value, and the written file reads back the same."""
 
+import ast
 import dataclasses
+import inspect
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pytest
 
 from nerfvol.config.assemble import assemble, parse_assignment, read_yaml, write_yaml
-from nerfvol.config.values import Colour, Count, colour, positive, seconds
+from nerfvol.config.splats import SplatConfig
+from nerfvol.config.training import FINEST_LEVEL, Config, DistillConfig, FieldConfig, FieldShape, OctreeConfig
+from nerfvol.config.values import (
+    Checked,
+    Colour,
+    Count,
+    above,
+    at_least,
+    colour,
+    hints_of,
+    increasing_to_one,
+    same_length,
+    seconds,
+    within,
+)
 from nerfvol.errors import InputError
+from nerfvol.region import SceneBounds
 
 
 @dataclass(frozen=True)
-class Stage:
-    resolution: int = 64
-    until: float = 1.0
+class Stage(Checked):
+    section: ClassVar[str] = "stage"
+
+    resolution: Annotated[int, within(2, 128)] = 64
+    end: Annotated[float, above(0, 1)] = 1.0
 
 
 @dataclass
-class Section:
+class Section(Checked):
+    section: ClassVar[str] = "section"
+    former: ClassVar[dict[str, str]] = {"depth": "levels", "speed": "it is always 3"}
+
     rate: float = 0.3
     levels: int = 3
+    first: list[Annotated[float, at_least(0)]] = dataclasses.field(default_factory=lambda: [0.5, 1.0])
+    second: tuple[int, ...] = (1, 2)
     widths: tuple[int, ...] = (4, 8)
     aabb: tuple[float, float, float] | None = None
     weights: dict[str, float] = dataclasses.field(default_factory=dict)
 
-    def __post_init__(self):
-        if self.levels > 16:
-            raise InputError(f"levels must be at most 16, got {self.levels}")
+    def check(self):
+        same_length(self, "first", "second")
+        increasing_to_one(self, "first")
 
 
 @dataclass
@@ -95,11 +120,23 @@ def test_every_kind_of_value():
         ({"section": {"aabb": [1, 2]}}, "section.aabb: expected a list of 3, got 2"),
         ({"section": {"aabb": 5}}, "section.aabb: expected a list, got 5"),
         ({"section": {"weights": 5}}, "section.weights: expected keys and values, got 5"),
-        ({"section": {"levels": 17}}, "a.yaml: levels must be at most 16, got 17"),
+        ({"wibble": 1}, "a.yaml: unknown key 'wibble'"),
+        ({"rate": 1}, "a.yaml: unknown key 'rate'; did you mean 'section.rate'?"),
+        ({"section": {"depth": 17}}, "a.yaml: section.depth was renamed to section.levels"),
+        ({"section": {"speed": 17}}, "a.yaml: section.speed is no longer a setting: it is always 3"),
+        ({"section": {"first": [0.5, -1]}}, "a.yaml: section.first: expected a number of at least 0, got -1"),
+        (
+            {"section": {"first": [1]}},
+            "section.second must have one entry per stage, as many as section.first (1), got 2",
+        ),
+        ({"section": {"first": []}}, "section.first must have an entry for each stage, got none"),
+        ({"section": {"first": [0.7, 0.5]}}, "section.first must increase and end with 1, got [0.7, 0.5]"),
+        ({"stage": {"resolution": 1}}, "a.yaml: stage.resolution: expected a number from 2 to 128, got 1"),
+        ({"stage": {"end": 0}}, "a.yaml: stage.end: expected a number above 0 and at most 1, got 0"),
         ({"resume": 2}, "resume: expected true or false, got 2"),
         ({"data": 3}, "data: expected text, got 3"),
         ({"downscale": 0}, "downscale: expected a number of at least 1, got 0"),
-        ({"downscale": "-2"}, "downscale: expected a number of at least 1, got '-2'"),
+        ({"downscale": "-2"}, "downscale: expected a number of at least 1, got -2"),
         ({"downscale": "two"}, "downscale: expected a whole number, got 'two'"),
         ({"downscale": None}, "downscale: expected a whole number, got None"),
         ({"budget": "5 minutes"}, "budget: expected a duration such as 120s, 5m or 1h"),
@@ -130,12 +167,11 @@ def test_bad_seconds(bad):
         seconds(bad)
 
 
-def test_colour_and_positive():
+def test_colour():
     assert colour("White") == (1, 1, 1) and colour("black") == (0, 0, 0) and colour([0, 0.5, 1]) == (0, 0.5, 1)
     for bad in ("1,1", "1,1,1,1", "a,b,c", None, 3, "nan,0,0", [2, 0, 0]):
         with pytest.raises(ValueError, match="white, black"):
             colour(bad)
-    assert positive(1) == 1 and positive("word") == "word"
 
 
 def test_written_file_reads_back_the_same(tmp_path):
@@ -177,3 +213,80 @@ def test_assignments():
     for bad in ("levels", "=3", "a..b=1", "a-b=1", "x=[1"):
         with pytest.raises(InputError, match="--set"):
             parse_assignment(bad)
+
+
+def test_nothing_far_off_is_suggested():
+    with pytest.raises(InputError) as error:
+        build({"section": {"wibble": 1}})
+    assert "did you mean" not in str(error.value)
+
+
+def test_settings_that_belong_together_may_come_one_by_one():
+    """What holds between settings is looked at when all of them are there."""
+    settings = build({"section": {"first": [1.0]}}, ({"section": {"second": [7]}}, "--set"))
+    assert (settings.section.first, settings.section.second) == ([1.0], (7,))
+
+
+@pytest.mark.parametrize(
+    "make, sentence",
+    [
+        (lambda: Stage(resolution=1), "stage.resolution: expected a number from 2 to 128, got 1"),
+        (
+            lambda: Section(first=[1]),
+            "section.second must have one entry per stage, as many as section.first (1), got 2",
+        ),
+        (lambda: OctreeConfig(levels=[40]), f"octree.levels: expected a number from 1 to {FINEST_LEVEL}, got 40"),
+        (lambda: OctreeConfig(rate_decay=0), "octree.rate_decay: expected a number above 0 and at most 1, got 0.0"),
+        (lambda: FieldConfig(rate=0), "field.rate: expected a number above 0 and at most 1000, got 0.0"),
+        (lambda: FieldConfig(shape={"width": 3}), "field.shape: expected FieldShape(...), got {'width': 3}"),
+        (lambda: FieldShape(skip=1), "field.shape.skip must be below field.shape.depth (1), got 1"),
+        (lambda: DistillConfig(level=0), f"distill.level: expected a number from 1 to {FINEST_LEVEL}, got 0"),
+        (lambda: SplatConfig(beta2=2), "splats.beta2: expected a number from 0.5 to 0.99999, got 2.0"),
+        (lambda: Config(downscale=0), "downscale: expected a number of at least 1, got 0"),
+    ],
+)
+def test_settings_made_in_python_are_checked_the_same_way(make, sentence):
+    with pytest.raises(InputError) as error:
+        make()
+    assert str(error.value) == sentence
+
+
+SECTIONS = (OctreeConfig, FieldConfig, FieldShape, DistillConfig, SplatConfig)
+
+
+@pytest.mark.parametrize("cls", SECTIONS)
+def test_every_number_has_a_range(cls):
+    """A setting that is added without one would go unchecked; a bias may be any number."""
+    for name, hint in hints_of(cls).items():
+        if any(kind in str(hint) for kind in ("int", "float")) and name != "density_bias":
+            assert "Interval" in str(hint), name
+
+
+@pytest.mark.parametrize("cls", SECTIONS)
+def test_old_names_lead_to_present_ones(cls):
+    """In the sentence for each former key there is a setting that exists, or a reason; and no setting is called so still."""
+    present = hints_of(cls)
+    for old, new in cls.former.items():
+        assert old not in present and (" " in new or new in present)
+        with pytest.raises(
+            InputError, match=f"{cls.section}.{old} (was renamed to {cls.section}.{new}|is no longer a setting: )"
+        ):
+            assemble(Config, ({cls.section: {old: 1}}, "a.yaml"))
+
+
+@pytest.mark.parametrize("cls", (*SECTIONS, Config))
+def test_every_setting_is_explained(cls):
+    """One docstring each, below it: it is all the reference there is besides config.yaml."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body
+    for setting, after in zip(body, [*body[1:], None], strict=True):
+        if isinstance(setting, ast.AnnAssign) and "ClassVar" not in ast.unparse(setting.annotation):
+            assert isinstance(after, ast.Expr) and isinstance(after.value.value, str), setting.target.id
+
+
+@pytest.mark.parametrize(
+    "octree, distill, degree", [({}, {}, 1), ({"sh_degree": 2}, {}, 2), ({"sh_degree": 2}, {"sh_degree": 0}, 0)]
+)
+def test_a_distilled_octree_has_the_bands_of_the_octree_section(octree, distill, degree):
+    """Unless its own says otherwise."""
+    config = assemble(Config, ({"octree": octree, "distill": distill}, "a.yaml"))
+    assert config.for_scene(SceneBounds([[-1] * 3, [1] * 3], None, True)).distill.sh_degree == degree

@@ -35,9 +35,9 @@ def test_the_table_compares_with_shadow_rays_and_makes_maps_again(monkeypatch, c
     for module, name in ((integrators.gather, "gather"), (integrators.shadowmap, "build")):
         monkeypatch.setattr(module, name, counting(name, getattr(module, name)))
     scene = cumulus(EVENING_SUN, resolution=24)
-    bench.single_scattering("test", scene, size=8, beams=1, repeats=3)
+    bench.single_scattering("test", scene, size=8, beams=1, repeats=2)
     # The first render of a method, then each repetition; a further view of the same scene reads what is there.
-    assert made == ["gather"] * 4 + ["build"] * 8
+    assert made == ["gather"] * 3 + ["build"] * 6
     lines = capsys.readouterr().out.splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines[4:]]
     assert [row[0].split(",")[0] for row in rows] == ["shadow rays", "deep", "deep", "deep"]

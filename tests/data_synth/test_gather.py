@@ -53,7 +53,7 @@ def test_sweep_is_the_integral_to_the_light():
 
 
 def test_sweep_beside_a_hard_edge_is_not_negative():
-    """Cubics swing below 0 beside the shadow of a block; a negative thickness would be more light than there is."""
+    """Cubics swing below 0 next to the shadow of a block; a negative thickness would be more light than there is."""
     rho = np.zeros((40, 40, 40), np.float32)
     rho[15:25, 15:25, 15:25] = 1.0
     thickness = sweep.thickness(rho, (0.1,) * 3, (0.6, 0.2, np.sqrt(1 - 0.4)))

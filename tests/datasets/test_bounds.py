@@ -56,7 +56,7 @@ def test_bounds_scale_and_move_with_the_scene(has_alpha, scale):
     np.testing.assert_allclose(moved.aabb, scale * (plain.aabb + center), rtol=1e-9)
 
 
-def test_photographs_reach_to_the_cameras_and_have_surroundings():
+def test_photographs_reach_to_the_cameras_and_have_background_shells():
     scene, _ = estimate_bounds(hemisphere(), has_alpha=False)
     np.testing.assert_allclose(scene.aabb, [[-4.031] * 3, [4.031] * 3], rtol=1e-9)
     np.testing.assert_allclose(scene.background_cube, 16 * scene.aabb)

@@ -69,6 +69,6 @@ def test_what_stands_before_a_lens(tiny_scene):
     inside, outside = (positions + factor * radius * outwards for factor in (0.99, 1.01))
     points = np.concatenate([positions, inside, outside])
     assert not dataset.before_a_lens(points).any()
-    surroundings = SceneBounds(dataset.scene.aabb, 8 * dataset.scene.aabb, has_alpha=False)
-    hidden = dataclasses.replace(dataset, scene=surroundings).before_a_lens(points)
+    with_shells = SceneBounds(dataset.scene.aabb, 8 * dataset.scene.aabb, has_alpha=False)
+    hidden = dataclasses.replace(dataset, scene=with_shells).before_a_lens(points)
     assert hidden.tolist() == [True] * 24 + [False] * 12

@@ -95,7 +95,7 @@ def test_missing_photographs_of_a_model_are_left_out(tmp_path):
 @pytest.mark.parametrize("text", [False, True])
 def test_poses_that_do_not_fit_the_points_of_the_model_are_doubted(tmp_path, text):
     """Poses of other photographs: half of the cameras look away from what their images are said to show, or stand so that
-    it lies beside them. Where they look at it nothing is said, also right at the edge of their images."""
+    it lies next to them. Where they look at it nothing is said, also right at the edge of their images."""
     cameras = scenes.ring()
     k = cameras[0].intrinsics
     edge = 0.5 * min(k.width / k.fx, k.height / k.fy) * 4.0  # at the ring's middle, 4 away

@@ -1,12 +1,14 @@
 """Training rays in tiles: whose pixels, in which directions, how often and with which weight."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.datasets import tiles
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.tiles import Cursor, TileBank
+from nerfvol.datasets.tiles import Cursor, Cursors, TileBank
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
@@ -74,34 +76,40 @@ def test_rays_of_a_tile_are_neighbours(odd):
     assert spread < 8 * np.sqrt(2) * 1.1 / (1.2 * 13)  # the diagonal of 8 pixels of the widest lens
 
 
-def test_plain_tiles_are_the_background_and_nothing_else(odd):
+def test_background_tiles_are_the_background_and_nothing_else(odd):
     white, black = TileBank(odd, WHITE, 1), TileBank(odd, (0.0, 0.0, 0.0), 1)
-    assert 0 < len(white.plain_tiles) < white.n_tiles
-    assert np.array_equal(white.plain_tiles, black.plain_tiles)  # transparent pixels take whatever colour is behind
+    assert 0 < len(white.background_tiles) < white.n_tiles
+    assert np.array_equal(
+        white.background_tiles, black.background_tiles
+    )  # transparent pixels take whatever colour is behind
     targets = whole_batch(white).target.reshape(white.n_tiles, -1)
-    assert np.array_equal((targets == 1).all(1), white.plain)
-    assert np.array_equal(np.sort(np.concatenate([white.rich_tiles, white.plain_tiles])), np.arange(white.n_tiles))
-    # of the plain ones a picture keeps one, and how many there are is known before
-    assert sum(map(len, white.pixels)) == len(white.rich_tiles) + len(odd)
-    assert tiles.rich_share(odd, WHITE, views=100) == len(white.rich_tiles) / white.n_tiles
+    assert np.array_equal((targets == 1).all(1), white.is_background)
+    assert np.array_equal(
+        np.sort(np.concatenate([white.foreground_tiles, white.background_tiles])), np.arange(white.n_tiles)
+    )
+    # of the background tiles a picture keeps one, and how many there are is known before
+    assert sum(map(len, white.pixels)) == len(white.foreground_tiles) + len(odd)
+    assert tiles.foreground_share(odd, WHITE, views=100) == len(white.foreground_tiles) / white.n_tiles
 
 
 def drawn(bank: TileBank, n: int, count: int, share: float = 0.6, seed: int = 5):
-    rich, plain = Cursor(), Cursor()
-    return [bank.draw(n, share, seed, rich, plain) for _ in range(count)], rich, plain
+    cursors = Cursors()
+    return [bank.draw(n, share, seed, cursors) for _ in range(count)], cursors
 
 
 def test_the_expected_loss_is_the_mean_over_all_pixels(odd):
     """Over whole epochs of both queues, weights times errors add up to the mean over pixels, whatever the share."""
     bank = TileBank(odd, WHITE, 1)
-    n_rich, n_plain = len(bank.rich_tiles), len(bank.plain_tiles)
+    n_foreground, n_background = len(bank.foreground_tiles), len(bank.background_tiles)
     share = 0.75
-    steps = n_rich * n_plain  # 4 tiles a step: 3 rich, 1 plain; whole epochs of both
+    steps = (
+        n_foreground * n_background
+    )  # 4 tiles a step: 3 of the foreground, 1 of the background; whole epochs of both
     everything = whole_batch(bank)
     error = (everything.target**2).mean(-1)
     wanted = (error * everything.weight).sum() / bank.n_tiles
-    batches, rich, plain = drawn(bank, 4, steps, share)
-    assert (rich.epoch, rich.position, plain.epoch, plain.position) == (3 * n_plain, 0, n_rich, 0)
+    batches, cursors = drawn(bank, 4, steps, share)
+    assert cursors == Cursors(Cursor(3 * n_background, 0), Cursor(n_foreground, 0))
     found = np.mean([((b.target**2).mean(-1) * b.weight).sum() / 4 for b in batches])
     assert found == pytest.approx(wanted, rel=1e-5)
     assert np.mean([b.weight.sum() for b in batches]) == pytest.approx(
@@ -111,36 +119,36 @@ def test_the_expected_loss_is_the_mean_over_all_pixels(odd):
 
 def test_an_epoch_visits_each_tile_once_and_orders_differ(odd):
     bank = TileBank(odd, WHITE, 1)
-    n = len(bank.rich_tiles)
-    rich, plain = Cursor(), Cursor()
+    n = len(bank.foreground_tiles)
+    cursors = Cursors()
     epochs = []
     for _ in range(2):
-        order = [tuple(bank.draw(1, 1.0, 3, rich, plain).rays_d[0]) for _ in range(n)]
+        order = [tuple(bank.draw(1, 1.0, 3, cursors).rays_d[0]) for _ in range(n)]
         assert len(set(order)) == n
         epochs.append(order)
     assert epochs[0] != epochs[1] and set(epochs[0]) == set(epochs[1])
-    other = [tuple(bank.draw(1, 1.0, 4, *cursors).rays_d[0]) for cursors in [(Cursor(), Cursor())] for _ in range(n)]
+    other = [tuple(bank.draw(1, 1.0, 4, cursors).rays_d[0]) for cursors in [Cursors()] for _ in range(n)]
     assert other != epochs[0]
 
 
 def test_the_cursors_are_all_there_is_to_remember(odd):
-    """A bank made anew with the cursors of the old one goes on with the same tiles, also across epochs."""
+    """A bank made again with the cursors of the old one goes on with the same tiles, also across epochs."""
     batches, *_ = drawn(TileBank(odd, WHITE, 1), 7, 12)
-    rich, plain = Cursor(), Cursor()
+    cursors = Cursors()
     for i, expected in enumerate(batches):
-        rich, plain = Cursor(rich.epoch, rich.position), Cursor(plain.epoch, plain.position)
-        batch = TileBank(odd, WHITE, 1).draw(7, 0.6, 5, rich, plain)
+        cursors = Cursors.of(dataclasses.asdict(cursors))
+        batch = TileBank(odd, WHITE, 1).draw(7, 0.6, 5, cursors)
         for name in ("rays_o", "rays_d", "target", "weight"):
             assert np.array_equal(getattr(batch, name), getattr(expected, name)), (i, name)
 
 
 @pytest.mark.parametrize("content", [0.0, 1.0])
-def test_only_plain_or_only_rich_tiles(content):
+def test_only_background_or_only_foreground_tiles(content):
     """With one of the queues empty the other fills the batch, at weight 1."""
     dataset = views([(16, 16), (16, 24)], content)
     bank = TileBank(dataset, WHITE, 1)
-    assert (len(bank.rich_tiles) == 0) == (content == 0)
-    batch = bank.draw(6, 0.8, 0, Cursor(), Cursor())
+    assert (len(bank.foreground_tiles) == 0) == (content == 0)
+    batch = bank.draw(6, 0.8, 0, Cursors())
     assert batch.rays_o.shape == (6, 3) and (batch.weight == 1).all()
 
 

@@ -115,7 +115,7 @@ def test_truncated_exp_is_exp_and_never_overflows() -> None:
 
 
 def test_contraction() -> None:
-    """Linear inside the detail cube, 2 - 1/x outside, onto [-1, 1] at the outermost; monotonic and continuous."""
+    """Linear inside the inner cube, 2 - 1/x outside, onto [-1, 1] at the outermost; monotonic and continuous."""
     domain = Domain((1.0, 0.0, 0.0), 2.0, outer=8.0)
     scale = 1 / (2 - 1 / 8)
     t = torch.linspace(0, 16, 4001, dtype=torch.float64)

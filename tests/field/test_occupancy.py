@@ -133,7 +133,7 @@ def test_collapse_is_an_error_that_says_what_to_try() -> None:
     for step in range(30):
         grid.probe(lambda p: torch.zeros(len(p)), 16384, step_generator(0, step))
     grid.refresh()
-    with pytest.raises(InputError, match="collapsed to empty.*--background.*learning_rate.*--init direct"):
+    with pytest.raises(InputError, match="collapsed to empty.*--background.*field.rate.*--init direct"):
         grid.check_not_empty()
     assert len(grid.march(*rays(10, BOUNDED, False), StepSchedule(BOUNDED, 64)).ray_indices) == 0
 

@@ -326,7 +326,7 @@ def assert_gradients_agree(case: Case, eps: float = 0.0) -> None:
     ours, theirs = kernel_gradient(octree, rays_o, rays_d, cotangents, eps), true_gradient(case, eps)
     bound = rounding.output_gradient_bounds(traced(case, eps), octree, BACKGROUND, *cotangents)
     assert_within("gradient", ours, theirs, bound)
-    # A test that allows everything tests nothing: on the whole the bound is small beside the gradient.
+    # A test that allows everything tests nothing: on the whole the bound is small against the gradient.
     assert np.linalg.norm(bound) < 0.05 * np.linalg.norm(theirs)
 
 

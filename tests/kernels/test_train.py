@@ -212,17 +212,17 @@ def test_statistics_of_the_leaves(isa):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_statistics_alone_are_those_of_a_step(isa, degree, compiled, monkeypatch):
-    """Bit by bit, and the query moves nothing: neither values nor what a state keeps beside its statistics."""
+    """Bit by bit, and the query moves nothing: neither values nor what a state keeps besides its statistics."""
     case = Case("mixed", degree, 233, n=3)
     octree, batch = copy_of(build(case)[0]), batch_of(case)
-    octree.averages = kept = object()
+    octree.prefiltered = kept = object()
     if not compiled:
         monkeypatch.setattr(ops, "native", lambda: None)
     alone, state = ops.TrainState(octree), ops.TrainState(octree)
     alone.moments[:] = 0.5
     values = octree.values.copy()
     first = ops.leaf_statistics(octree, batch, LOSSES["all"], PIXEL_ANGLE, alone)
-    assert np.array_equal(octree.values, values) and octree.averages is kept
+    assert np.array_equal(octree.values, values) and octree.prefiltered is kept
     assert (alone.moments == 0.5).all() and (alone.slots == -1).all()
     assert first == ops.train_step(octree, state, batch, LOSSES["all"], RATES, PIXEL_ANGLE)
     for name in ("max_weight", "error", "footprint"):
@@ -230,7 +230,7 @@ def test_statistics_alone_are_those_of_a_step(isa, degree, compiled, monkeypatch
 
 
 def test_options_reach_the_kernels_by_their_names():
-    """Every field of the Python classes, with a number of its own, and none that the kernels have beside them."""
+    """Every field of the Python classes, with a number of its own, and none that the kernels have besides them."""
     if (compiled := native()) is None:
         pytest.skip("no compiled kernels")
     options = ops.LossOptions((0.5, 0.25, 0.125), *(np.arange(1, 5) / 8), early_stop_eps=0.75)

@@ -1,4 +1,4 @@
-"""Level of detail: averages of nodes, and pictures in which nodes stand in for their leaves."""
+"""Level of detail: prefiltered nodes, and pictures drawn with them in place of their leaves."""
 
 import math
 
@@ -38,7 +38,7 @@ def sides_and_centres(octree: Octree) -> tuple[np.ndarray, np.ndarray]:
     return side, octree.origin + (place_nodes(octree.node_mask, starts) + 0.5) * side[:, None]
 
 
-# ------------------------------------------------------------------ averages
+# ------------------------------------------------------------------ prefiltered nodes
 @pytest.mark.parametrize("pixels", [0.0, 0.5, 2.0, 1e6])
 def test_a_constant_cube_is_exp_minus_sigma_l_at_any_level_of_detail(pixels):
     octree = cube(4)
@@ -61,12 +61,12 @@ def test_inner_corners_of_nodes_carry_a_linear_field():
     slope = np.array([1.0, -0.5, 0.25])
     octree.density = explin_inverse(4 + octree.vertex_positions() @ slope)
     octree.sh = (octree.vertex_positions() @ slope)[:, None, None] * np.ones((1, 3, 4))
-    averages = lod.node_averages(octree)
+    prefiltered = lod.prefiltered_nodes(octree)
     side, centre = sides_and_centres(octree)
     place = centre[:, None] + (OFFSETS - 0.5) * side[:, None, None]
     inner = (np.abs(place) < 0.99).all(-1)
     assert len(np.unique(np.repeat(side[:, None], 8, 1)[inner])) == 3  # levels 1 to 3
-    sigma = explin(averages.values[averages.corners][..., DENSITY_SLOT])
+    sigma = explin(prefiltered.values[prefiltered.corners][..., DENSITY_SLOT])
     np.testing.assert_allclose(sigma[inner], (4 + place @ slope)[inner], rtol=1e-4)
 
 
@@ -76,12 +76,12 @@ def test_colour_is_weighted_by_opacity():
     low = octree.vertex_positions()[:, 2] < 0
     octree.density = np.where(low, 3.0, -20.0)
     octree.sh = np.where(low[:, None], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0])[:, :, None]
-    averages = lod.node_averages(octree)
-    red = averages.values[averages.corners[0]][:, [0, 4, 8]]
+    prefiltered = lod.prefiltered_nodes(octree)
+    red = prefiltered.values[prefiltered.corners[0]][:, [0, 4, 8]]
     np.testing.assert_allclose(red, np.broadcast_to([1, -1, -1], red.shape), atol=1e-4)
 
 
-def test_averages_conserve_thin_matter():
+def test_prefiltered_nodes_conserve_thin_matter():
     """Parallel rays on a symmetric grid see the mean optical depth, whatever the cells; second order in the depth."""
     octree = cube(3, scale=2e-3, degree=0)
     octree.density = np.random.default_rng(0).uniform(1, 3, octree.n_vertices)
@@ -93,8 +93,8 @@ def test_averages_conserve_thin_matter():
         -np.log1p(-ops.render_rays(octree, o, d, early_stop_eps=0.0, outputs=("opacity",), coarse=c)["opacity"]).mean()
         for c in (0.0, 0.011, 0.021, 1.0)  # nodes of level 2, 1, 1
     ]
-    assert lod.standing_in(octree, (-50, 0, 0), 0.011).sum() == 64
-    assert not lod.standing_in(octree, (-50, 0, 0), 1.0)[0]  # the root is always opened
+    assert lod.lod_cut(octree, (-50, 0, 0), 0.011).sum() == 64
+    assert not lod.lod_cut(octree, (-50, 0, 0), 1.0)[0]  # the root is always opened
     deepest = 3 * 2e-3 * 2
     np.testing.assert_allclose(depth, depth[0], rtol=deepest)
     assert depth[1] != depth[0]
@@ -112,7 +112,7 @@ def test_walls_stay_opaque_and_edges_where_they_are():
     for cells in (1, 2):
         side = 2 / 32 * 2**cells
         coarse = 1.02 * side / 100
-        assert lod.standing_in(octree, (-100, -0.5, 0), coarse).any()
+        assert lod.lod_cut(octree, (-100, -0.5, 0), coarse).any()
         opacity = ops.render_rays(octree, o, d, early_stop_eps=0.0, outputs=("opacity",), coarse=coarse)["opacity"]
         # By the module's head: tau = 13.8 from one axis of three, the wall in one of two layers at its corners; means of
         # transmittance over points would give less than 0.9 and 0.65.
@@ -120,34 +120,34 @@ def test_walls_stay_opaque_and_edges_where_they_are():
         assert (opacity[y > 0] == 0).all()
 
 
-def test_averages_are_the_same_without_compiled_kernels(monkeypatch):
+def test_prefiltered_nodes_are_the_same_without_compiled_kernels(monkeypatch):
     octree = random_octree("mixed", 2, np.random.default_rng(4))
     if native.native() is None:
         pytest.skip("no compiled kernels")
-    compiled = lod.node_averages(octree)
-    octree.averages = None
+    compiled = lod.prefiltered_nodes(octree)
+    octree.prefiltered = None
     monkeypatch.setattr(lod, "native", lambda: None)
-    plain = lod.node_averages(octree)
+    plain = lod.prefiltered_nodes(octree)
     assert np.array_equal(plain.corners, compiled.corners)
     np.testing.assert_allclose(plain.values, compiled.values, rtol=0, atol=1e-5)  # sums of some 64 numbers of order 1
 
 
-def test_averages_are_kept_until_the_values_change():
+def test_prefiltered_nodes_are_kept_until_the_values_change():
     octree = random_octree("mixed", 1, np.random.default_rng(5))
-    first = lod.node_averages(octree)
-    assert lod.node_averages(octree) is first
-    assert octree.subdivide(np.zeros(octree.n_leaves, bool))[0].averages is None
-    assert octree.prune(np.ones(octree.n_leaves, bool))[0].averages is None
-    assert octree.with_sh_degree(2).averages is None
+    first = lod.prefiltered_nodes(octree)
+    assert lod.prefiltered_nodes(octree) is first
+    assert octree.subdivide(np.zeros(octree.n_leaves, bool))[0].prefiltered is None
+    assert octree.prune(np.ones(octree.n_leaves, bool))[0].prefiltered is None
+    assert octree.with_sh_degree(2).prefiltered is None
     for change in (
         lambda: setattr(octree, "values", octree.values),
         lambda: setattr(octree, "density", octree.density + 1),
         lambda: setattr(octree, "sh", octree.sh + 1),
         lambda: train_once(octree),
     ):
-        lod.node_averages(octree)
+        lod.prefiltered_nodes(octree)
         change()
-        assert octree.averages is None
+        assert octree.prefiltered is None
 
 
 def train_once(octree: Octree) -> None:
@@ -160,14 +160,14 @@ def train_once(octree: Octree) -> None:
 @pytest.mark.parametrize("kind", ["mixed", "full", "sparse", "single"])
 @pytest.mark.parametrize("coarse", [0.05, 0.15, 0.6])
 def test_the_walk_draws_the_cut_octree(kind, coarse):
-    """Bit by bit: a node that stands in is a leaf. Some of the origins are inside the octree."""
+    """Bit by bit: a node that is not opened is a leaf. Some of the origins are inside the octree."""
     rng = np.random.default_rng(6)
     octree = random_octree(kind, 1, rng)
     origins, d = camera_tiles(octree, rng, 8)
     stood_in = 0
     for tile, origin in enumerate(origins):
         rays = origin[None], d[64 * tile : 64 * tile + 64]
-        nodes = lod.standing_in(octree, origin, coarse)
+        nodes = lod.lod_cut(octree, origin, coarse)
         stood_in += nodes.sum()
         image, expected = ops.render_rays(octree, *rays, coarse=coarse), ops.render_rays(lod.cut(octree, nodes), *rays)
         for name in OUTPUTS:
@@ -192,15 +192,15 @@ def test_any_number_of_threads_gives_the_same_bits():
         pytest.skip("no compiled kernels")
     octree = random_octree("mixed", 1, np.random.default_rng(8))
     camera, before = camera_at((2.5, 1.0, 0.7), 50), ops.get_threads()
-    images, averages = [], []
+    images, prefiltered = [], []
     for n in (1, 2, 3):
         ops.set_threads(n)
-        octree.averages = None
+        octree.prefiltered = None
         images.append(render_image(octree, camera, lod=4.0)["rgb"])
-        averages.append(octree.averages.values)
+        prefiltered.append(octree.prefiltered.values)
     ops.set_threads(before)
     for k in (1, 2):
-        assert np.array_equal(images[0], images[k]) and np.array_equal(averages[0], averages[k])
+        assert np.array_equal(images[0], images[k]) and np.array_equal(prefiltered[0], prefiltered[k])
 
 
 def test_without_small_nodes_every_bit_is_that_of_the_leaves(sphere_octree):
@@ -208,7 +208,7 @@ def test_without_small_nodes_every_bit_is_that_of_the_leaves(sphere_octree):
     side, centre = sides_and_centres(sphere_octree)
     smallest = (side / np.linalg.norm(centre - camera.position, axis=1))[1:].min() * camera.intrinsics.fx
     exact = render_image(sphere_octree, camera, lod=0.0)
-    assert lod.may_stand_in(sphere_octree, camera.position, 0.999 * smallest / camera.intrinsics.fx)
+    assert lod.has_lod_cut(sphere_octree, camera.position, 0.999 * smallest / camera.intrinsics.fx)
     below, above = (render_image(sphere_octree, camera, lod=factor * smallest) for factor in (0.999, 1.2))
     for name in OUTPUTS:
         assert np.array_equal(below[name], exact[name]), name
@@ -287,7 +287,7 @@ def test_a_constant_field_stays_when_simplified():
 
 
 def test_vertices_between_cells_have_the_mean_by_opacity():
-    """A leaf of level 1 beside a node that becomes one: on their common face each counts once."""
+    """A leaf of level 1 next to a node that becomes one: on their common face each counts once."""
     octree = Octree.from_leaves([1] + [2] * 8, [[0, 0, 0], *(OFFSETS + [2, 0, 0])], (-1, -1, -1), 2.0, 0, 1.5)
     octree.density = np.where(octree.vertex_positions()[:, 0] < 0.25, 0.8, 2.5)
     octree.sh = np.where(octree.vertex_positions()[:, 0] < 0.25, -1.0, 1.0)[:, None, None] * np.ones((1, 3, 1))

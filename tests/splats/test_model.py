@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
+from nerfvol.clouds import PointModel
 from nerfvol.errors import InputError
 from nerfvol.kernels.splat_state import SplatState
 from nerfvol.splats.io import load_splats, save_splats
+from nerfvol.splats.points import PointCloud
 from nerfvol.splats.splats import Splats
-from nerfvol.views import SplatModel, depth_range, surface_depth, unit_normal
+from nerfvol.views import OctreeModel, SplatModel, depth_range, surface_depth, unit_normal
 
 SLOPE = np.array([[0.1, 0.0, 0.02], [0.02, 0.0, -0.1], [-0.07, 0.0, 0.06]])
 """Of the wall's colours by place."""
@@ -112,6 +114,15 @@ def test_a_model_of_nothing(compiled, tmp_path):
     assert SplatModel.load(tmp_path / "none.safetensors").packed.n == 0
     near, far = depth_range(model, [camera_at(PINHOLE)])
     assert 0 <= near <= far
+
+
+def test_an_unknown_storage_is_one_sentence_from_every_model(tmp_path, sphere_octree):
+    """Splats have one storage; a wrong name is still a mistake."""
+    points = PointModel(PointCloud(np.eye(3), np.full((3, 3), 0.5, np.float32)))
+    for model in (OctreeModel(sphere_octree), SplatModel(wall(step=1.0)), points):
+        with pytest.raises(InputError, match="storage should be float32, float16 or compact, got 'int3'"):
+            model.save(tmp_path / "a.safetensors", "int3")
+    assert not (tmp_path / "a.safetensors").exists()
 
 
 @pytest.mark.parametrize("far", [3.0, 100.0, 3000.0])

@@ -18,7 +18,16 @@ from nerfvol.octree.rows import explin
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
-from nerfvol.starts.field import Frame, candidate_cells, dilated, distill, largest_sigma, largest_weights, write_values
+from nerfvol.starts.field import (
+    Frame,
+    candidate_cells,
+    dilated,
+    distill,
+    judged_downscale,
+    largest_sigma,
+    largest_weights,
+    write_values,
+)
 
 DOMAIN = Domain((0.1, -0.2, 0.3), 1.0)
 CENTER = torch.tensor(DOMAIN.center)
@@ -135,7 +144,7 @@ def test_opacity_is_the_closed_form() -> None:
 def test_whole_distillation_loses_little() -> None:
     field = Blob()
     dataset = views(field)
-    config = DistillConfig(level=5, coarse_level=3, compare_views=3, compare_downscale=1, visibility_downscale=1)
+    config = DistillConfig(level=5, coarse_level=3)
     octree, report = distill(
         field, DOMAIN, dataset, (1, 1, 1), config, render_field=lambda camera: field.image(camera, (1, 1, 1))
     )
@@ -188,7 +197,7 @@ def test_a_hazy_field_has_coarser_leaves() -> None:
         found = candidate_cells(Blob(), Frame.of(DOMAIN, 5), config, messages)
         assert all(np.array_equal(*pair) for pair in zip(found, candidates[which], strict=True)), most
         if which:
-            assert len(messages) == 1 and f"1/{32 >> which} of the region" in messages[0] and "hazy" in messages[0]
+            assert len(messages) == 1 and f"1/{32 >> which} of the inner cube" in messages[0] and "hazy" in messages[0]
         else:
             assert not messages
 
@@ -227,7 +236,7 @@ def test_nothing_is_left_before_a_lens() -> None:
     middle = bounds.mean(0)
     dataset.scene = dataclasses.replace(dataset.scene, background_cube=middle + 4 * (bounds - middle))
     domain = dataclasses.replace(DOMAIN, outer=4.0)
-    config = DistillConfig(level=4, coarse_level=3, visibility_downscale=1, prune_weight=0.0, merge_tolerance=0.0)
+    config = DistillConfig(level=4, coarse_level=3, prune_weight=0.0, merge_tolerance=0.0)
     octree, report = distill(Everywhere(), domain, dataset, (1, 1, 1), config)
     assert report.leaves > 4**3 and not dataset.before_a_lens(octree.leaf_centers()).any()
 
@@ -253,7 +262,7 @@ def test_dilation_is_one_cell() -> None:
 
 
 def test_leaves_grow_outside_the_detail() -> None:
-    """With a background: full level inside the detail cube, one level less at each doubling of the distance."""
+    """With a background: full level inside the inner cube, one level less at each doubling of the distance."""
 
     class Everywhere(Blob):
         def density(self, positions: torch.Tensor) -> torch.Tensor:
@@ -389,3 +398,17 @@ def test_values_do_not_depend_on_the_parts(monkeypatch, samples) -> None:
     )  # of the vertices of two sizes of leaves; the last part is shorter
     write_values(parts, Blob(), samples)
     np.testing.assert_allclose(parts.values, whole.values, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("side, factor", [(24, 1), (399, 1), (400, 2), (800, 4), (4000, 4)])
+def test_leaves_are_judged_by_images_of_some_size(side, factor):
+    """Small images as they are; of large ones about 200 pixels, and never less than a quarter of what there is."""
+    lens = Intrinsics(side, side // 2 or 1, side, side, side / 2, side / 4)
+    dataset = Dataset(
+        orbit(1, center=(0, 0, 0), radius=3, elevation_deg=10, intrinsics=lens),
+        [],
+        ["a"],
+        SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, True),
+        "test",
+    )
+    assert judged_downscale(dataset) == factor

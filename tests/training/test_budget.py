@@ -149,7 +149,7 @@ def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
     """12 pictures of 25 tiles, of which those that show the sphere count."""
     run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
     plan = OctreePlan(run.config, run.data.training, 0)
-    assert 100 < plan.rich_tiles <= 300
+    assert 100 < plan.foreground_tiles <= 300
     octree = run.config.octree
 
     def most_steps(epochs: float) -> float:
@@ -157,6 +157,6 @@ def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
             run.data.training, (1, 1, 1), dataclasses.replace(octree, most_epochs=epochs), plan=plan
         ).most_steps
 
-    drawn = octree.tiles[-1] * octree.rich_share
-    assert most_steps(1e4) == pytest.approx(1e4 * plan.rich_tiles / drawn)
+    drawn = octree.tiles[-1] * octree.foreground_share
+    assert most_steps(1e4) == pytest.approx(1e4 * plan.foreground_tiles / drawn)
     assert most_steps(1.0) == most_steps(0.5) > 0  # however few the tiles

@@ -19,7 +19,7 @@ from nerfvol.training.field_trainer import FieldTrainer, PixelBank, domain_of, i
 
 TINY = FieldConfig(
     shape=FieldShape(width=16, hash_levels=4, hash_log2_table=10, hash_min=4, hash_max=24),
-    steps=60, downscales=(4, 2), stage_ends=(0.3, 1.0), march_steps=(32, 48), samples_per_step=2048, max_rays=512,
+    steps=60, downscales=(4, 2), stage_ends=(0.3, 1.0), march_steps=(32, 48), samples_per_step=2048,
     grid_resolution=16,
 )  # fmt: skip
 
@@ -103,7 +103,7 @@ def test_a_checkpoint_of_another_network_is_refused(dataset: Dataset) -> None:
 
 def test_collapse_to_empty_space_is_reported() -> None:
     """Images that show nothing but background: an error after some steps, not a silent empty result."""
-    trainer = FieldTrainer(ball_dataset(blank=True), dataclasses.replace(TINY, learning_rate=0.05), seed=0)
+    trainer = FieldTrainer(ball_dataset(blank=True), dataclasses.replace(TINY, rate=0.05), seed=0)
     with pytest.raises(InputError, match="collapsed to empty space"):
         for _ in range(400):
             trainer.step(0.1)
@@ -181,7 +181,7 @@ def test_domain_of_scenes() -> None:
 @pytest.mark.parametrize(
     "change",
     [{"downscales": (4, 2, 1)}, {"stage_ends": (0.5, 0.9)}, {"stage_ends": (1.0, 1.0), "downscales": (0, 1)},
-     {"samples_per_step": 0}, {"grid_resolution": 30}, {"learning_rate": 0.0}, {"final_learning_rate": 2.0}],
+     {"samples_per_step": 0}, {"grid_resolution": 30}, {"rate": 0.0}, {"rate_decay": 2.0}],
 )  # fmt: skip
 def test_refuses_impossible_settings(change: dict) -> None:
     with pytest.raises(InputError, match="field"):

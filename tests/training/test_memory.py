@@ -12,7 +12,7 @@ from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.training import memory
 from nerfvol.training.memory import (
-    Beside,
+    OtherMemory,
     affordable_leaves,
     estimate_training,
     gib,
@@ -41,7 +41,7 @@ def test_octree_bytes_are_those_of_its_arrays(degree):
 
 
 @pytest.mark.parametrize("degree", [1, 2])
-def test_changing_an_octree_takes_what_is_reckoned_with(degree):
+def test_changing_an_octree_takes_what_was_planned_for(degree):
     """Splitting a fifth of the leaves; the second moments follow when the old values are gone."""
 
     def change(new, transfer):
@@ -87,23 +87,31 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
 def test_images_count(dataset):
     """Tiles by what a bank really holds; the files' pixels as long as they cannot be released for a larger octree."""
     bank = TileBank(dataset, (1.0, 1.0, 1.0), 1)
-    held = [*bank.pixels, bank.row, bank.image, bank.tile, bank.plain, bank.rich_tiles, bank.plain_tiles]
-    share = Beside(rich_share=len(bank.rich_tiles) / len(bank.row), held_out_bytes=77)
+    held = [
+        *bank.pixels,
+        bank.row,
+        bank.image,
+        bank.tile,
+        bank.is_background,
+        bank.foreground_tiles,
+        bank.background_tiles,
+    ]
+    share = OtherMemory(foreground_share=len(bank.foreground_tiles) / len(bank.row), held_out_bytes=77)
     tiles = sum(array.nbytes for array in held)
     small, large = (estimate_training(dataset, leaves, 1, share).images for leaves in (0, 10**6))
     assert large - 77 == pytest.approx(tiles, rel=0.1)
     assert small == large + dataset.nbytes
-    # An octree that is there has beside it what is there.
+    # An octree that is there has next to it what is there.
     assert estimate_training(dataset, 10**6, 1, share, vertices=10**6).images == small
     fixed = dataclasses.replace(dataset, images=dataset.images[:])  # nothing to read these from again
     assert estimate_training(fixed, 10**6, 1, share).images == small
 
 
 def test_a_field_counts(dataset):
-    """Beside a large octree by what it leaves behind, whatever its size; beside a small one by its distillation."""
+    """Next to a large octree by what it leaves behind, whatever its size; next to a small one by its distillation."""
 
     def estimates(leaves):
-        return (estimate_training(dataset, leaves, 1, Beside(1.0, 77, field=field)) for field in (False, True))
+        return (estimate_training(dataset, leaves, 1, OtherMemory(1.0, 77, field=field)) for field in (False, True))
 
     (plain, field), (larger, larger_field) = estimates(10**7), estimates(2 * 10**7)
     assert field.peak - plain.peak == larger_field.peak - larger.peak > 0 and "distil" not in plain.sentence()

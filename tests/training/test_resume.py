@@ -182,7 +182,7 @@ def test_clock_and_running_error_go_on_where_the_checkpoint_left_them(whole, tmp
 @pytest.mark.parametrize("change", [
     lambda t: t.update(values=t["values"][:-1], moments=t["moments"][:-1]), lambda t: t.update(moments=t["moments"][:, :4]),
     lambda t: t.update(error=t["error"][:-1]), lambda t: t.update(footprint=t["footprint"][None]),
-    lambda t: t.update(node_mask=t["node_mask"][:-1]), lambda t: t.update(stage="first"), lambda t: t.pop("rich"),
+    lambda t: t.update(node_mask=t["node_mask"][:-1]), lambda t: t.update(stage="first"), lambda t: t.pop("cursors"),
 ])  # fmt: skip
 def test_a_checkpoint_whose_parts_do_not_fit_is_refused(whole, tmp_path, tiny_scene, change):
     with pytest.raises(InputError):

@@ -1,4 +1,4 @@
-"""The training run: memory let go on the way, errors, what cannot be used, a real scene."""
+"""The training run: memory released on the way, errors, what cannot be used, a real scene."""
 
 import dataclasses
 import gc
@@ -24,7 +24,7 @@ from tests.fixtures.tiny import write_scene
 @pytest.mark.parametrize("downscales, checkpoint_every, last", [
     ([2, 1, 1], 1000, 1), ([2, 1, 1], 1e-9, 1), ([1, 1, 1], 1e-9, 0)
 ])  # fmt: skip
-def test_the_pictures_are_let_go_once_they_are_in_tiles(
+def test_the_pictures_are_released_once_they_are_in_tiles(
     tmp_path, tiny_scene, monkeypatch, downscales, checkpoint_every, last
 ):
     """From the second step of the stage whose tiles serve to the end; ``last``: the first stage of the last resolution."""
@@ -149,7 +149,7 @@ def test_lego_small(tmp_path, init, command):
         "octree": {**TINY["octree"], "steps": 150, "levels": [5, 6, 7], "tiles": [64, 128, 128]},
         "field": {"steps": 40, "downscales": [2, 1], "stage_ends": [0.5, 1.0], "march_steps": [64, 96],
                   "samples_per_step": 8192},
-        "distill": {"level": 6, "coarse_level": 4, "compare_views": 1, "visibility_downscale": 2},
+        "distill": {"level": 6, "coarse_level": 4},
         "compare_views": 1, "threads": 1,
     }  # fmt: skip
     (tmp_path / "plan.yaml").write_text(json.dumps(plan))

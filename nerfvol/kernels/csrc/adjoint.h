@@ -62,7 +62,7 @@ private:
     size_t capacity_ = 0, row_floats_ = 0;
 };
 
-// Where each vertex stands in VertexGradients: open addressing in a table that cannot fill up, as a rule a quarter full since
+// Where each vertex is in VertexGradients: open addressing in a table that cannot fill up, as a rule a quarter full since
 // leaves share corners.
 class VertexTable {
 public:
@@ -140,7 +140,7 @@ void forward_packet(const Tree& tree, Packet<1>& p, const BasisRows<B>& basis, f
     });
 }
 
-// Per ray, what the adjoint needs beside the hits.
+// Per ray, what the adjoint needs besides the hits.
 struct Adjoint {
     f4 colour[kTile];                      // dL/dC, and dL/d(expected distance in root cubes)
     float behind[kTile];                   // S: starts at T_N q_N

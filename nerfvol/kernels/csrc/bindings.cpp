@@ -52,7 +52,7 @@ void init_tree(TreeArrays* self, In<uint8_t, nb::ndim<1>> node_mask, In<uint8_t,
                Maybe<In<int32_t, nb::shape<-1, 8>>> node_corners, Maybe<Rows> node_values, float coarse) {
     if (coarse > 0 && (!node_corners || !node_values || node_corners->shape(0) != node_mask.shape(0) ||
                        node_values->shape(1) != values.shape(1)))
-        throw std::invalid_argument("coarse cells need averages for every node");
+        throw std::invalid_argument("a level of detail needs prefiltered values for every node");
     auto* t = new (self)
         TreeArrays{node_mask, leaf_mask, first_node, first_leaf, corners, values, node_corners, node_values, {}};
     Tree& v = t->tree;

@@ -50,7 +50,7 @@ inline void load_square(const Tree& tree, const View& view, int64_t row, int64_t
     bound_packet(p);
 }
 
-// Hits that wait to be composited, front to back: extinction is dear and worked out for sixteen at a time, while a leaf
+// Hits that wait to be composited, front to back: extinction is expensive and worked out for sixteen at a time, while a leaf
 // is met by three rays on average. A ray that ends leaves a few hits behind here, which are dropped.
 struct Waiting {
     static constexpr int kCapacity = 2 * kTile;  // small, to stay in the core's nearest cache
@@ -73,7 +73,7 @@ struct Waiting {
     }
 };
 
-// What a packet's rays gather beside colour.
+// What a packet's rays gather besides colour.
 template <int S> struct Extras {
     float median[S * kTile] = {}, normal[S * kTile][3] = {};
 };

@@ -28,8 +28,8 @@ inline void sh_basis(int degree, float x, float y, float z, float* b) {
     b[15] = -0.5900435899266435f * x * (x * x - 3 * y * y);
 }
 
-// Slot of the raw density in a vertex row. Coefficient k of channel c stands at 16 (k / 4) + 4 c + k % 4, save that degree 2's
-// ninth coefficients stand at 28 + c (nerfvol/octree/rows.py has the same rule).
+// Slot of the raw density in a vertex row. Coefficient k of channel c is stored at 16 (k / 4) + 4 c + k % 4, save that degree 2's
+// ninth coefficients at 28 + c (nerfvol/octree/rows.py has the same rule).
 constexpr int kDensitySlot = 12;
 
 // Per ray: the basis in the places of a vertex row, with 1 at the raw density.
@@ -55,7 +55,7 @@ template <int B> struct BasisRows {
     }
 };
 
-// Trilinear weights of the eight corners; corner o stands at offsets (o>>2&1, o>>1&1, o&1).
+// Trilinear weights of the eight corners; corner o is at offsets (o>>2&1, o>>1&1, o&1).
 inline f8 trilinear(float fx, float fy, float fz) {
     const f8 sx = {-1, -1, -1, -1, 1, 1, 1, 1}, ax = {1, 1, 1, 1, 0, 0, 0, 0};
     const f8 sy = {-1, -1, 1, 1, -1, -1, 1, 1}, ay = {1, 1, 0, 0, 1, 1, 0, 0};

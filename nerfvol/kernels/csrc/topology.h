@@ -20,7 +20,7 @@ void find_sources(const int32_t* corners, const int32_t* parent, const int8_t* o
 void interpolate(const float* rows, int64_t width, const int32_t* old_corners, const int32_t* source, const int8_t* place,
                  int64_t n_vertices, float* out);
 
-// The transpose of interpolation, for averages over nodes: adds to sums (n, 8, width) the rows at the corners of those
+// The transpose of interpolation, for prefiltered nodes: adds to sums (n, 8, width) the rows at the corners of those
 // children of n nodes that `mask` names, weighted by `weight` (of each vertex) and the trilinear weight of the place in the
 // node over 8. `first` (n): the number of each node's first such child, corners (children, 8). The slot `density` of a row
 // counts as 1. Absent children add nothing.

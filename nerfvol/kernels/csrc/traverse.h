@@ -19,7 +19,7 @@ struct Leaf {
     uint64_t patches;
 };
 
-// What a ray crosses: leaf `index`, or node `index - n_leaves` that stands in for its leaves.
+// What a ray crosses: leaf `index`, or node `index - n_leaves` that is drawn in place of its leaves.
 struct Cell {
     const int32_t* corners;
     const float* values;
@@ -130,13 +130,13 @@ private:
     }
 
     // Whether some child of a node may be that small: a bound for all of them at once, from the node's centre.
-    bool may_stand_in(const float* to_centre, float h) const {
+    bool may_be_cut(const float* to_centre, float h) const {
         return h * h < 2 * tree_.coarse * tree_.coarse * (dot3(to_centre, to_centre) + h * h);
     }
 
     void expand(const Entry& e, uint64_t patches) {
         const float h = 0.5f * e.side, centre[3] = {e.x + h - p_.o[0], e.y + h - p_.o[1], e.z + h - p_.o[2]};
-        const bool small = tree_.coarse > 0 && may_stand_in(centre, h);
+        const bool small = tree_.coarse > 0 && may_be_cut(centre, h);
         const uint32_t nodes = tree_.node_mask[e.index], leaves = tree_.leaf_mask[e.index];
         uint32_t present = nodes | leaves;
         alignas(64) uint64_t inside[8] = {patches, patches, patches, patches, patches, patches, patches, patches};

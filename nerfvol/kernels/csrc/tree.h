@@ -22,8 +22,8 @@ struct Tree {
     int sh_degree;
     float origin[3], size;                       // root cube, scene units
     float density_scale;                         // 1 / scene unit
-    const int32_t* node_corners;                 // (n_nodes, 8) rows of node_values; null where averages are not used
-    const float* node_values;                    // what stands in for everything below a node (nerfvol/octree/lod.py)
+    const int32_t* node_corners;                 // (n_nodes, 8) rows of node_values; null where no node is prefiltered
+    const float* node_values;                    // prefiltered values of everything below a node (nerfvol/octree/lod.py)
     float coarse;                                // a node does where its side is below this many times its distance; 0: none
 };
 
@@ -34,7 +34,7 @@ struct Rays {
 };
 
 // A camera's rays: directions in camera axes, by squares of 16x16 pixels, rows of squares from the top; squares may reach
-// beyond the edges. packet.h says how a square's pixels stand in its four strips.
+// beyond the edges. packet.h says how a square's pixels are stored in its four strips.
 struct View {
     const float* directions;                     // (square rows, square columns, 4, 3, 64) unit length
     int64_t square_rows, square_columns, height, width;

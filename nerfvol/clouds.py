@@ -1,0 +1,114 @@
+"""Point clouds as models, and what a PLY file is: Gaussians or points."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras.camera import Camera
+from nerfvol.cameras.through_lens import through_lens
+from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
+from nerfvol.errors import InputError
+from nerfvol.kernels.checks import check_background, check_early_stop
+from nerfvol.kernels.splat_state import view_of
+from nerfvol.kernels.state import OUTPUTS
+from nerfvol.octree.io import storage_of
+from nerfvol.splats.io import save_splats
+from nerfvol.splats.ply import is_splat_ply
+from nerfvol.splats.points import PointCloud, read_points, splats_of_points
+from nerfvol.splats.splats import Splats
+from nerfvol.views import SplatModel
+
+if TYPE_CHECKING:
+    from nerfvol.models import Model
+
+Float = NDArray[np.float32]
+Composite = Literal["over", "surface"]
+
+
+class PointModel:
+    """A point cloud as a model (models.Model), drawn by EWA splatting: a point is as wide as its neighbours are far.
+
+    ``composite``: "over": almost opaque Gaussians one over the other; "surface": those at one depth are averaged first
+    (kernels.point_surfaces), which no gap or overlap of points shows in.
+    """
+
+    kind = "points"
+
+    def __init__(
+        self, cloud: PointCloud, metadata: Mapping[str, Any] | None = None, composite: Composite = "over"
+    ) -> None:
+        self.cloud, self.metadata, self.composite = cloud, dict(metadata or {}), composite
+        self._model = SplatModel(splats_of_points(cloud), metadata)
+
+    @property
+    def near(self) -> float:
+        """What is nearer to a camera's plane is not drawn, scene units."""
+        return self._model.near
+
+    @property
+    def splats(self) -> Splats:
+        """What is drawn, a copy."""
+        return self._model.splats
+
+    def render(
+        self,
+        camera: Camera,
+        background: Sequence[float] | None = None,
+        outputs: Sequence[str] = ("rgb",),
+        early_stop_eps: float = DEFAULT_EARLY_STOP,
+        lod: float = DEFAULT_LOD,
+    ) -> dict[str, Float]:
+        """See models.Model; through any lens. ``lod`` changes nothing."""
+        if self.composite == "over":
+            return self._model.render(camera, background, outputs, early_stop_eps, lod)
+        from nerfvol.kernels.point_surfaces import render_surfaces
+
+        colour = check_background(self.metadata.get("background", WHITE) if background is None else background)
+        eps, splats = check_early_stop(early_stop_eps), self.splats
+        if unknown := set(outputs) - set(OUTPUTS):
+            raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
+
+        def pinhole(seen: Camera) -> dict[str, Float]:
+            drawn = render_surfaces(splats, view_of(seen, splats.origin, self.near), colour, eps)
+            return {name: drawn[name] for name in outputs}
+
+        return through_lens(pinhole, camera)
+
+    def aabb(self) -> NDArray[np.float64]:
+        """(2, 3) corners of the box around the middle 98 % of the points, as for splats."""
+        return self._model.aabb()
+
+    def describe(self) -> dict[str, Any]:
+        """Count, whether there are normals, the median distance that points are drawn apart, bounding box, bytes."""
+        return {
+            "points": len(self.cloud),
+            "normals": self.cloud.normals is not None,
+            "radius": float(f"{np.exp(np.median(self.splats.log_scales[:, 0])):.4g}"),
+            "aabb": self.aabb().tolist(),
+            "bytes_in_memory": int(self._model.packed.params.nbytes + self.cloud.positions.nbytes),
+        }
+
+    def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
+        """The Gaussians that draw the points, as a file of splats; ``storage`` as in SplatModel.save."""
+        storage_of(storage)
+        return save_splats(path, self.splats, self.metadata)
+
+
+def load_ply_model(path: str | os.PathLike[str]) -> Model:
+    """The Gaussians (3DGS layout) or the coloured points of a PLY file.
+
+    Raises:
+        InputError: one sentence that names the file and what is wrong with it.
+    """
+    if is_splat_ply(path):
+        return SplatModel.load(path)
+    cloud = read_points(path)
+    try:
+        return PointModel(cloud)
+    except InputError as error:
+        raise InputError(f"{path} cannot be drawn: {error}") from error
