@@ -24,7 +24,8 @@ _ENDS = {  # share of progress at which 1/8, 1/4 and 1/2 of the size end
     4: (0.40, 0.35, 0.25, 0.20, 0.12, 0.07, 0.04, 0.02),
     2: (0.85, 0.80, 0.70, 0.60, 0.45, 0.33, 0.25, 0.20),
 }
-_GROWN = (0.60, 0.60, 0.50, 0.50, 0.35, 0.30, 0.20, 0.15)
+_STEPS = {True: {8: 600, 4: 2000, 2: 4000}, False: {8: 300, 4: 500, 2: 1500}}  # of photographs and objects, in 30 s
+_GROWN = (0.40, 0.40, 0.35, 0.30, 0.25, 0.20, 0.20, 0.15)
 _PHOTOGRAPHS = (25e3, 35e3, 50e3, 80e3, 130e3, 180e3, 220e3, 300e3)
 _OBJECTS = (35e3, 50e3, 75e3, 105e3, 155e3, 172e3, 200e3, 250e3)
 
@@ -32,16 +33,20 @@ _OBJECTS = (35e3, 50e3, 75e3, 105e3, 155e3, 172e3, 200e3, 250e3)
 @dataclass(frozen=True)
 class Schedule:
     """factors: of the photographs' reduction, one a stage, the last 1. ends: progress at which each stage ends. most: Gaussians
-    at the end of growth, which lasts from ``GROWTH_STARTS`` to ``grown``."""
+    at the end of growth, which lasts from ``GROWTH_STARTS`` to ``grown``. steps: at which each stage but the last ends before
+    that; none: no bound."""
 
     factors: tuple[int, ...]
     ends: tuple[float, ...]
     most: int
     grown: float
+    steps: tuple[int, ...] = ()
 
-    def stage(self, progress: float) -> int:
-        """The stage of ``progress`` in [0, 1]."""
-        return sum(progress >= end for end in self.ends[:-1])
+    def is_over(self, stage: int, progress: float, steps: int) -> bool:
+        """Whether ``stage`` ends at ``progress`` in [0, 1], after ``steps`` steps in it; the last one never does."""
+        if stage + 1 >= len(self.factors):
+            return False
+        return progress >= self.ends[stage] or bool(self.steps) and steps >= self.steps[stage]
 
     def planned(self, start: int, progress: float) -> int:
         """Gaussians that there should be at ``progress`` where ``start`` were there first: exponential growth."""
@@ -65,24 +70,29 @@ def make_schedule(
     while longest / (2 * coarsest) >= COARSEST_SIDE and coarsest < 64:
         coarsest *= 2
     factors = tuple(2**k for k in range(int(math.log2(coarsest)), -1, -1))
-    ends = []
+    ends, steps = [], []
     for factor in factors[:-1]:
+        # On small pictures a fast machine makes thousands of steps in a share of the time that teach nothing new.
+        steps.append(int(_STEPS[photographs][min(factor, 8)] * (seconds / 30) ** 0.7))
         end = _at(_ENDS[min(factor, 8)], seconds)
         ends.append(end * (8 / factor) ** 2 if factor > 8 else end)
     pixels = sum(width * height for width, height in sizes)
     affordable = int(_at(_PHOTOGRAPHS if photographs else _OBJECTS, seconds))
     wanted = most if most is not None else min(affordable, max(1000, pixels // PIXELS_PER_SPLAT))
-    return Schedule(factors, (*ends, 1.0), wanted, _at(_GROWN, seconds))
+    return Schedule(factors, (*ends, 1.0), wanted, _at(_GROWN, seconds), tuple(steps))
 
 
 def saved_schedule(state: Mapping[str, Any]) -> Schedule:
     """The schedule in a trainer's state; LookupError, TypeError or ValueError where there is none."""
     factors, ends = tuple(int(f) for f in state["factors"]), tuple(float(e) for e in state["ends"])
-    schedule = Schedule(factors, ends, int(state["most"]), float(state["grown"]))
+    steps = tuple(int(n) for n in state["steps_of_stages"])
+    schedule = Schedule(factors, ends, int(state["most"]), float(state["grown"]), steps)
     halved = tuple(2**k for k in range(len(factors) - 1, -1, -1))
     in_order = all(0 <= a <= b <= 1 for a, b in zip((0.0, *ends), ends, strict=False))
     if not 1 <= len(factors) == len(ends) <= 7 or factors != halved or not in_order or ends[-1] != 1:
         raise ValueError(f"sizes {factors} until {ends} are no schedule")
+    if steps and (len(steps) != len(factors) - 1 or min(steps) < 0):
+        raise ValueError(f"stages of {steps} steps are no schedule")
     if schedule.most < 1 or not schedule.grown > GROWTH_STARTS:
         raise ValueError(f"growth to {schedule.most} until {schedule.grown} is no schedule")
     return schedule

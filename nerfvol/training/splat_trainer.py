@@ -58,7 +58,7 @@ class SplatTrainer:
         self.state = SplatState(splats)
         self.started_with = self.state.n
         self.steps = config.steps
-        self.steps_done, self.stage = 0, 0
+        self.steps_done, self.stage, self.stage_began = 0, 0, 0
         self.seen_since = 0  # steps since what was not seen was last asked for
 
     # ------------------------------------------------------------------ what a run asks of a phase
@@ -98,7 +98,8 @@ class SplatTrainer:
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs."""
         return {
-            **self.state.arrays(), "stage": self.stage, "steps_done": self.steps_done, "started_with": self.started_with,
+            **self.state.arrays(), "stage": self.stage, "steps_done": self.steps_done, "stage_began": self.stage_began,
+            "started_with": self.started_with, "steps_of_stages": list(self.schedule.steps),
             "seen_since": self.seen_since, "factors": list(self.schedule.factors), "ends": list(self.schedule.ends),
             "most": self.schedule.most, "grown": self.schedule.grown, "subject_distance": self.subject_distance,
         }  # fmt: skip
@@ -106,7 +107,7 @@ class SplatTrainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from :meth:`state_dict` as if nothing had happened."""
         self.state = SplatState.from_arrays(state)
-        for name in ("stage", "steps_done", "started_with", "seen_since"):
+        for name in ("stage", "stage_began", "steps_done", "started_with", "seen_since"):
             setattr(self, name, int(state[name]))
         self.schedule = saved_schedule(state)
         self.subject_distance = float(state["subject_distance"])
@@ -118,10 +119,9 @@ class SplatTrainer:
     # ------------------------------------------------------------------ the schedule
     def step(self, progress: float) -> StepReport:
         """One view at ``progress`` in [0, 1] of the run."""
-        stage = self.schedule.stage(progress)
-        if stage != self.stage:
+        while self.schedule.is_over(self.stage, progress, self.steps_done - self.stage_began):
             self.photographs.drop(self.schedule.factors[self.stage])
-            self.stage = stage
+            self.stage, self.stage_began = self.stage + 1, self.steps_done
         if self.steps_done and self.steps_done % self.config.grow_every == 0:
             self.grow(progress)
         view = self.photographs.view(self._next_view(), self.schedule.factors[self.stage])

@@ -59,13 +59,13 @@ def test_small_photographs_take_a_smaller_share_of_a_longer_run():
             assert all(x >= y for x, y in zip(a.ends, b.ends, strict=True)) and a.grown >= b.grown
 
 
-def test_the_stage_is_the_one_whose_end_is_next():
+def test_a_stage_ends_by_its_share_or_by_its_steps_and_the_last_one_never():
     for _, _, _, s in schedules():
-        stages = [s.stage(p) for p in STEPS]
-        assert stages[0] == 0 and stages[-1] == len(s.factors) - 1
-        assert all(0 <= b - a for a, b in zip(stages, stages[1:], strict=False))
-        for k, end in enumerate(s.ends[:-1]):
-            assert s.stage(math.nextafter(end, 0)) == k and s.stage(end) == k + 1
+        last = len(s.factors) - 1
+        assert len(s.steps) == last and not s.is_over(last, 1.0, 10**9)
+        for k, (end, steps) in enumerate(zip(s.ends, s.steps, strict=False)):
+            assert s.is_over(k, end, 0) and not s.is_over(k, math.nextafter(end, 0), steps - 1)
+            assert s.is_over(k, 0.0, steps) == (steps >= 0) and not s.is_over(k, 0.0, steps - 1)
 
 
 def test_more_seconds_give_more_splats_but_no_more_than_pixels_can_teach():
@@ -102,11 +102,11 @@ def test_growth_is_exponential_from_its_start_to_its_end_and_never_beyond_the_mo
 @pytest.mark.parametrize("change", [
     {"factors": (2, 2)}, {"factors": ()}, {"factors": (3, 1)}, {"factors": (4, 1)}, {"ends": (0.5,)}, {"ends": (0.5, 0.9)},
     {"ends": (1.5, 1.0)}, {"ends": (float("nan"), 1.0)}, {"most": 0}, {"grown": 0.0}, {"grown": float("nan")},
-    {"factors": "ab"}, {"most": "many"}, {"ends": None},
+    {"factors": "ab"}, {"steps_of_stages": (1, 2)}, {"steps_of_stages": (-1,)}, {"most": "many"}, {"ends": None},
 ])  # fmt: skip
 def test_a_checkpoint_without_a_schedule(change):
-    state = {"factors": (2, 1), "ends": (0.5, 1.0), "most": 100, "grown": 0.5}
-    assert saved_schedule(state) == Schedule(**state)
+    state = {"factors": (2, 1), "ends": (0.5, 1.0), "most": 100, "grown": 0.5, "steps_of_stages": (7,)}
+    assert saved_schedule(state) == Schedule((2, 1), (0.5, 1.0), 100, 0.5, (7,))
     with pytest.raises((LookupError, TypeError, ValueError)):
         saved_schedule(state | change)
     for name in state:
