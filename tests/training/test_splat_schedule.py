@@ -35,7 +35,8 @@ def test_stages_halve_down_to_the_whole_photographs_and_end_in_order():
         assert len(s.ends) == len(s.factors) and s.ends[-1] == 1, what
         assert all(0 < a < b for a, b in zip(s.ends, s.ends[1:], strict=False)), what
         assert GROWTH_STARTS < s.grown < 1, what
-        assert saved_schedule({"factors": s.factors, "ends": s.ends, "most": s.most, "grown": s.grown}) == s
+        state = {"factors": s.factors, "ends": s.ends, "most": s.most, "grown": s.grown, "steps_of_stages": s.steps}
+        assert saved_schedule(state) == s
 
 
 @pytest.mark.parametrize(
