@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from nerfvol import sh as spherical
 from nerfvol.cameras.camera import Camera, Intrinsics, orbit
 from nerfvol.config.training import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.field.fields import Domain
-from nerfvol.octree.merge import merge_smooth
 from nerfvol.octree.rows import explin
-from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 from nerfvol.starts.field import (
@@ -28,45 +25,7 @@ from nerfvol.starts.field import (
     largest_weights,
     write_values,
 )
-
-DOMAIN = Domain((0.1, -0.2, 0.3), 1.0)
-CENTER = torch.tensor(DOMAIN.center)
-
-
-class Blob:
-    """sigma = peak exp(-|x|^2 / (2 s^2)), SH colour that varies linearly in space."""
-
-    has_sh, sh_degree = True, 1
-
-    def __init__(self, peak: float = 20.0, width: float = 0.25) -> None:
-        self.peak, self.width = peak, width
-
-    def density(self, positions: torch.Tensor) -> torch.Tensor:
-        x = positions - CENTER.to(positions.dtype)
-        return self.peak * torch.exp(-x.square().sum(-1) / (2 * self.width**2))
-
-    def sh(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        rows = torch.stack([positions * 0.3, 0.1 - positions * 0.2, positions.flip(-1), positions * 0.05], dim=-1)
-        return self.density(positions), rows
-
-    def __call__(self, positions: torch.Tensor, viewdirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        sigma, coefficients = self.sh(positions)
-        return sigma, spherical.eval_colour(coefficients, viewdirs)
-
-    def image(self, camera: Camera, background: tuple[float, float, float]) -> np.ndarray:
-        """Quadrature of the field itself, 400 midpoints a ray."""
-        from nerfvol.quadrature import accumulate, composite
-
-        o, d = (torch.from_numpy(a) for a in camera.rays())
-        near, far, n = 1.5, 4.5, 400
-        t = near + (far - near) * (torch.arange(n) + 0.5) / n
-        points = (o + d[:, None] * t[:, None]).reshape(-1, 3)
-        sigma, rgb = self(points, d.repeat_interleave(n, 0))
-        parts = composite(sigma.view(len(d), n), torch.tensor((far - near) / n))
-        colour = accumulate(parts.weights, rgb.view(len(d), n, 3)) + parts.trans_final[:, None] * torch.tensor(
-            background
-        )
-        return colour.clamp(0, 1).numpy().reshape(camera.intrinsics.height, camera.intrinsics.width, 3)
+from tests.fixtures.fields import CENTER, DOMAIN, Blob, full_octree, interpolate, random_points
 
 
 def views(field: Blob, n: int = 6, size: int = 48) -> Dataset:
@@ -77,28 +36,6 @@ def views(field: Blob, n: int = 6, size: int = 48) -> Dataset:
     return Dataset(
         cameras, images, [f"v{i}" for i in range(n)], SceneBounds(np.stack([low, high]), None, False), "test"
     )
-
-
-def full_octree(level: int, density_scale: float = 100.0) -> Octree:
-    ijk = np.array(list(np.ndindex(*[1 << level] * 3)))
-    origin, size = np.array(DOMAIN.center) - DOMAIN.half, 2 * DOMAIN.half
-    return Octree.from_leaves(np.full(len(ijk), level), ijk, origin, size, 1, density_scale)
-
-
-def interpolate(octree: Octree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Leaf, sigma and sh at points, by the octree's documented formula written out here."""
-    leaf = octree.query(points)
-    assert (leaf >= 0).all()
-    f = (points - octree.origin) / octree.leaf_sizes()[leaf][:, None] - octree.leaf_ijk[leaf]
-    weights = np.prod(np.where(OFFSETS[None] == 1, f[:, None], 1 - f[:, None]), axis=-1)
-    corners = octree.corners[leaf]
-    raw = (weights * octree.density[corners]).sum(1)
-    coefficients = (weights[..., None, None] * octree.sh[corners]).sum(1)
-    return leaf, octree.density_scale * explin(raw), coefficients
-
-
-def random_points(n: int, reach: float) -> np.ndarray:
-    return np.array(DOMAIN.center) + np.random.default_rng(0).uniform(-reach, reach, (n, 3))
 
 
 @pytest.mark.parametrize("samples", [1, 8])
@@ -279,56 +216,6 @@ def test_leaves_grow_outside_the_detail() -> None:
     assert (octree.leaf_level[distance < 1] == 5).all()
     assert (octree.leaf_level[(distance > 1) & (distance < 2)] == 4).all()
     assert (octree.leaf_level[distance > 2] == 3).all()
-
-
-def test_merging_changes_nothing_where_the_field_is_trilinear() -> None:
-    """A field that is linear in space merges to the coarsest leaves allowed, with the same values everywhere."""
-
-    class Linear(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
-            return 300 + 100 * positions[:, 0] - 50 * positions[:, 1]
-
-    octree = full_octree(4)
-    write_values(octree, Linear(), 1)
-    merged = merge_smooth(octree, 2, 1e-4)
-    merged.validate()
-    assert merged.n_leaves == 64 and (merged.leaf_level == 2).all()
-    points = random_points(500, 0.99)
-    for mine, other in zip(interpolate(merged, points)[1:], interpolate(octree, points)[1:], strict=True):
-        np.testing.assert_allclose(mine, other, rtol=1e-5, atol=1e-5)
-
-
-def test_merging_keeps_within_its_tolerance() -> None:
-    octree = full_octree(5)
-    write_values(octree, Blob(), 1)
-    sizes = []
-    for tolerance in (0.003, 0.03):
-        merged = merge_smooth(octree, 2, tolerance)
-        merged.validate()
-        sizes.append(merged.n_leaves)
-        points = random_points(4000, 0.99)
-        _, sigma, _ = interpolate(merged, points)
-        _, before, _ = interpolate(octree, points)
-        edge = 2 / 2**4  # of the siblings of the second merge, whose tolerance adds to that of the first
-        assert np.abs(np.exp(-sigma * edge / 2) - np.exp(-before * edge / 2)).max() < 3 * tolerance
-    assert sizes[1] < sizes[0] < octree.n_leaves
-    assert merge_smooth(octree, 2, 0.0) is octree
-
-
-@pytest.mark.parametrize("what", ["density", "red", "view dependence"])
-def test_a_step_is_not_merged(what: str) -> None:
-    """One differing vertex in the middle of eight siblings keeps them apart; their parents' neighbours still merge."""
-    octree = full_octree(3)
-    octree.density = np.full(octree.n_vertices, -3.0)  # an opacity of 0.37 a leaf
-    middle = np.argmin(np.abs(octree.vertex_positions() - octree.origin - 0.25).sum(1))
-    raw, coefficients = octree.density.copy(), octree.sh
-    raw[middle] += 0.1 * (what == "density")
-    coefficients[middle, 0, 0] += 0.1 * (what == "red")
-    coefficients[middle, 2, 3] += 0.1 * (what == "view dependence")
-    octree.density, octree.sh = raw, coefficients
-    merged = merge_smooth(octree, 2, 1e-3)
-    assert merged.n_leaves == 63 + 8 and (merged.leaf_level == 3).sum() == 8
-    np.testing.assert_array_equal(merged.leaf_ijk[merged.leaf_level == 3].max(0), [1, 1, 1])
 
 
 def test_hidden_leaves_have_no_weight() -> None:

@@ -1,0 +1,59 @@
+"""Merging leaves: nothing changes where the field is trilinear, little elsewhere, and a step stays."""
+
+import numpy as np
+import pytest
+import torch
+
+from nerfvol.octree.merge import merge_smooth
+from nerfvol.starts.field import write_values
+from tests.fixtures.fields import Blob, full_octree, interpolate, random_points
+
+
+def test_merging_changes_nothing_where_the_field_is_trilinear() -> None:
+    """A field that is linear in space merges to the coarsest leaves allowed, with the same values everywhere."""
+
+    class Linear(Blob):
+        def density(self, positions: torch.Tensor) -> torch.Tensor:
+            return 300 + 100 * positions[:, 0] - 50 * positions[:, 1]
+
+    octree = full_octree(4)
+    write_values(octree, Linear(), 1)
+    merged = merge_smooth(octree, 2, 1e-4)
+    merged.validate()
+    assert merged.n_leaves == 64 and (merged.leaf_level == 2).all()
+    points = random_points(500, 0.99)
+    for mine, other in zip(interpolate(merged, points)[1:], interpolate(octree, points)[1:], strict=True):
+        np.testing.assert_allclose(mine, other, rtol=1e-5, atol=1e-5)
+
+
+def test_merging_keeps_within_its_tolerance() -> None:
+    octree = full_octree(5)
+    write_values(octree, Blob(), 1)
+    sizes = []
+    for tolerance in (0.003, 0.03):
+        merged = merge_smooth(octree, 2, tolerance)
+        merged.validate()
+        sizes.append(merged.n_leaves)
+        points = random_points(4000, 0.99)
+        _, sigma, _ = interpolate(merged, points)
+        _, before, _ = interpolate(octree, points)
+        edge = 2 / 2**4  # of the siblings of the second merge, whose tolerance adds to that of the first
+        assert np.abs(np.exp(-sigma * edge / 2) - np.exp(-before * edge / 2)).max() < 3 * tolerance
+    assert sizes[1] < sizes[0] < octree.n_leaves
+    assert merge_smooth(octree, 2, 0.0) is octree
+
+
+@pytest.mark.parametrize("what", ["density", "red", "view dependence"])
+def test_a_step_is_not_merged(what: str) -> None:
+    """One differing vertex in the middle of eight siblings keeps them apart; their parents' neighbours still merge."""
+    octree = full_octree(3)
+    octree.density = np.full(octree.n_vertices, -3.0)  # an opacity of 0.37 a leaf
+    middle = np.argmin(np.abs(octree.vertex_positions() - octree.origin - 0.25).sum(1))
+    raw, coefficients = octree.density.copy(), octree.sh
+    raw[middle] += 0.1 * (what == "density")
+    coefficients[middle, 0, 0] += 0.1 * (what == "red")
+    coefficients[middle, 2, 3] += 0.1 * (what == "view dependence")
+    octree.density, octree.sh = raw, coefficients
+    merged = merge_smooth(octree, 2, 1e-3)
+    assert merged.n_leaves == 63 + 8 and (merged.leaf_level == 3).sum() == 8
+    np.testing.assert_array_equal(merged.leaf_ijk[merged.leaf_level == 3].max(0), [1, 1, 1])
