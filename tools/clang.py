@@ -13,7 +13,14 @@ import sys
 
 from own_build import build_kernels, run_tests
 
-TESTS = ("kernels", "octree", "test_views.py", "datasets/test_tiles.py")
+TESTS = (
+    "kernels",
+    "octree",
+    "test_views.py",
+    "datasets/test_tiles.py",
+    "splats/test_gradients.py",
+    "splats/test_step.py",
+)
 
 
 def main() -> int:

@@ -16,7 +16,10 @@ from pathlib import Path
 from own_build import build_kernels, run_tests
 
 # Every build of every kernel: images, gradients, steps, determinism (threads) and the refusals.
-TESTS = ("test_ops.py", "test_train.py", "test_determinism.py", "test_checks.py", "test_view.py")
+TESTS = (
+    *(f"kernels/{name}.py" for name in ("test_ops", "test_train", "test_determinism", "test_checks", "test_view")),
+    "splats/test_gradients.py", "splats/test_step.py", "starts/test_plane_sweep.py", "datasets/test_photographs.py",
+)  # fmt: skip
 
 
 def runtime(compiler: str) -> str:
@@ -41,7 +44,7 @@ def main() -> int:
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0:halt_on_error=1",
         "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
     }
-    return run_tests(build, [f"kernels/{name}" for name in TESTS], environment)
+    return run_tests(build, TESTS, environment)
 
 
 if __name__ == "__main__":
