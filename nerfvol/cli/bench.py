@@ -34,6 +34,7 @@ class BenchOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--sizes", metavar="LIST", help="square picture sizes (default: 400,800,1600)")
     p.add_argument("--repeats", metavar="N", help="the median of N measurements is reported (default: 5)")

@@ -37,6 +37,7 @@ class Parser(argparse.ArgumentParser):
     """argparse whose complaints end in one sentence, with a near option for a mistyped one."""
 
     def error(self, message: str) -> NoReturn:
+        """Raises InputError with ``message``, where argparse would print it and end the process."""
         raise InputError(f"{message} (see `{self.prog} --help`)")
 
     def check_leftovers(self, leftovers: Sequence[str]) -> None:

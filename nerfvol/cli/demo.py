@@ -34,6 +34,7 @@ class DemoOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     p.add_argument("--out", metavar="DIR", help="folder for everything (default: demo)")
     p.add_argument("--time-budget", metavar="TIME", help="for training (default: 150s)")
     p.add_argument("--threads", metavar="N", help="CPU threads (default: all)")

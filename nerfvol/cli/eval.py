@@ -38,6 +38,7 @@ class EvalOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--data", metavar="DIR", help="posed images to compare with (default: those of the run)")
     p.add_argument("--split", metavar="train|val|test", help="which views (default: val)")

@@ -26,6 +26,7 @@ class ExportOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--out", metavar="FILE", help="; ".join(
         f"{' or '.join(row.suffixes)}: {row.name} of {' or '.join(row.kinds)}, opened by {row.opened_by}"

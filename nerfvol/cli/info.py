@@ -20,6 +20,7 @@ class InfoOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     p.add_argument("target", metavar="RUN|FILE", nargs="?", help="model file or run folder; without: this machine")
     p.add_argument("--json", action="store_true", help="print JSON instead of text")
 

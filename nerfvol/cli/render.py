@@ -35,6 +35,7 @@ class RenderOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--cameras", metavar="FILE.json", help="camera path: a transforms JSON (docs/cli.md)")
     p.add_argument("--orbit", metavar="N", help="N views on a circle around the scene, as the training cameras stood")

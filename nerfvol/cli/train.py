@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     p.add_argument("--data", metavar="DIR", help=f"{formats_help()}; or a JSON file of transforms itself")
     p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
                    "previews/, checkpoint.safetensors")  # fmt: skip

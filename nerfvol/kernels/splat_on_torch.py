@@ -39,6 +39,7 @@ def gradient_rows(
 def loss_gradient(
     state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions
 ) -> tuple[np.ndarray, SplatReport]:
+    """splat_ops.loss_gradient on the reference: (n_blocks, rows, 16) float32; the report is as in :func:`train_step`."""
     rows, parts = gradient_rows(state, view, image, options)
     return packing.to_blocks(rows, np.zeros(rows.shape[1], np.float32)), _report(parts)
 

@@ -47,10 +47,12 @@ class Parameters:
 
     @classmethod
     def of(cls, splats: Splats, dtype: torch.dtype = torch.float64, requires_grad: bool = False) -> Parameters:
+        """A copy of the splats' arrays as tensors of ``dtype``; means stay relative to the splats' origin."""
         arrays = (splats.means, splats.log_scales, splats.quats, splats.logits, splats.sh)
         return cls(*(torch.tensor(a, dtype=dtype, requires_grad=requires_grad) for a in arrays))
 
     def tensors(self) -> tuple[Tensor, ...]:
+        """All five, in the order of the fields."""
         return self.means, self.log_scales, self.quats, self.logits, self.sh
 
 

@@ -152,6 +152,7 @@ class SplatState:
         return packing.unpack(self.packed)
 
     def reset_statistics(self) -> None:
+        """Begins again: error, max_weight and seen (n_blocks, 16) are zero."""
         self.error, self.max_weight, self.seen = (self._zeros((len(self.params), LANES)) for _ in range(3))
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -61,6 +61,7 @@ class Machine:
 
     @property
     def bandwidth(self) -> float:
+        """The larger of both rates, bytes/s."""
         return max(self.read, self.copy)
 
 

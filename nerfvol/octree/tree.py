@@ -105,18 +105,22 @@ class Octree:
     # ------------------------------------------------------------------ sizes and places
     @property
     def n_nodes(self) -> int:
+        """Interior nodes, the root among them."""
         return len(self.node_mask)
 
     @property
     def n_leaves(self) -> int:
+        """Leaves."""
         return len(self.corners)
 
     @property
     def n_vertices(self) -> int:
+        """Distinct corners of leaves: the rows of ``values``."""
         return self._n_vertices
 
     @property
     def max_level(self) -> int:
+        """Level of the finest leaves, 1 to 16."""
         return int(self.leaf_level.max())
 
     def leaf_sizes(self) -> np.ndarray:

@@ -49,10 +49,12 @@ class Splats:
 
     @property
     def n(self) -> int:
+        """Number of splats."""
         return len(self.means)
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the colours' spherical harmonics."""
         return math.isqrt(self.sh.shape[-1]) - 1
 
     def validate(self) -> Splats:

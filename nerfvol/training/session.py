@@ -57,6 +57,7 @@ class Clock:
         self._zero = (now - process_seconds() if started is None else started) - spent
 
     def elapsed(self) -> float:
+        """Seconds so far, those of earlier sessions included."""
         return time.perf_counter() - self._zero
 
 
@@ -120,6 +121,7 @@ class Run:
         return None if budget is None else max(0.0, budget - self._reserve - self.clock.elapsed())
 
     def phase_seconds(self) -> float:
+        """Seconds of wall clock since the present phase began, over all sessions."""
         return self.clock.elapsed() - self.phase_started
 
     def progress(self, phase: Phase) -> float:
@@ -185,6 +187,7 @@ class Run:
             self._log = None
 
     def checkpoint_due(self) -> bool:
+        """Whether the last checkpoint, or the start of this session, is ``checkpoint_every`` seconds ago."""
         return time.perf_counter() - self._last_save >= self.config.checkpoint_every
 
     def save(self, phase: Phase) -> None:
@@ -239,6 +242,7 @@ class Run:
             signal.signal(signal.SIGINT, before)
 
     def interruption(self, phase: Phase) -> KeyboardInterrupt:
+        """What to raise once a checkpoint was written after Ctrl-C; says where the run is and how to go on."""
         place = f"step {phase.steps_done} of the {phase.name}"
         self.say(f"saved at {place}; to go on: nerfvol train --resume --out {self.folder}")
         return KeyboardInterrupt()
