@@ -86,7 +86,11 @@ def add_drawing(p: argparse.ArgumentParser) -> None:
 
 
 def set_threads(threads: int) -> int:
-    """Use ``threads`` CPU threads (0: every core this process may use) in torch and the kernels; returns the number."""
+    """Use ``threads`` CPU threads (0: every core this process may use) in torch and the kernels; returns the number.
+
+    Raises:
+        InputError: fewer than 0.
+    """
     from nerfvol.machine import usable_cores
 
     if threads < 0:

@@ -41,7 +41,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: DemoOptions) -> int:
-    """Do everything in a folder and print where it is."""
+    """Do everything in a folder and print where it is; the exit code.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
     from nerfvol.files.atomic import ensure_writable_folder
     from nerfvol.training.train import train
 

@@ -51,7 +51,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: EvalOptions) -> int:
-    """Prints the scores and writes what the options ask for."""
+    """Prints the scores and writes what the options ask for; the exit code.
+
+    Raises:
+        InputError: no such model or images, or a path that cannot be written.
+    """
     need("eval", target=options.target)
     set_threads(options.threads)
     from nerfvol.datasets.load import load_dataset

@@ -41,7 +41,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: ExportOptions) -> int:
-    """Writes the file and prints what it is."""
+    """Writes the file and prints what it is; the exit code.
+
+    Raises:
+        InputError: no such model, a format that does not hold it, or a path that cannot be written.
+    """
     need("export", target=options.target, out=options.out)
     target = open_target(options.target)
     choose(options.out, target.model.kind, options.format)

@@ -26,7 +26,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: InfoOptions) -> int:
-    """Print the record, or only the machine's part where no file is named."""
+    """Print the record, or only the machine's part where no file is named; the exit code.
+
+    Raises:
+        InputError: no such model.
+    """
     from nerfvol.kernels import ops
     from nerfvol.machine import describe_hardware
 

@@ -51,7 +51,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: RenderOptions) -> int:
-    """Writes what the options ask for and prints where it is."""
+    """Writes what the options ask for and prints where it is; the exit code.
+
+    Raises:
+        InputError: options that do not go together, no such model or camera path, or a path that cannot be written.
+    """
     need("render", target=options.target, out=options.out)
     if (options.cameras is None) == (options.orbit is None):
         raise InputError("nerfvol render needs either --cameras FILE.json or --orbit N")

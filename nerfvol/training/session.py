@@ -62,7 +62,11 @@ class Clock:
 
 
 def read_saved(path: Path) -> dict[str, Any]:
-    """The state in a run's checkpoint, with everything that a continuation looks up in it."""
+    """The state in a run's checkpoint, with everything that a continuation looks up in it.
+
+    Raises:
+        InputError: there is no such file, it is damaged, or no checkpoint of a training run.
+    """
     state = load_checkpoint(path)
     phase = state.get("phase")
     needed = {"steps"} if phase == "done" else set(_STATE)
@@ -100,7 +104,11 @@ class Run:
         self._last_save = time.perf_counter()
 
     def enter(self, phase: Phase) -> None:
-        """Begin the phase, or go on inside it where the checkpoint was written in it."""
+        """Begin the phase, or go on inside it where the checkpoint was written in it.
+
+        Raises:
+            InputError: what the checkpoint holds does not fit the phase.
+        """
         resumed = self.saved["phase"] == phase.name
         if resumed:
             try:
@@ -134,7 +142,7 @@ class Run:
         return max(self.phase_seconds() / share, phase.steps_done / phase.most_steps) if share > 0 else 1.0
 
     def follow(self, phase: Phase, error: float) -> None:
-        """Keep the running error; a number that is none ends the run before it reaches a checkpoint."""
+        """Keep the running error; InputError where it is no number, before the run reaches a checkpoint."""
         if not math.isfinite(error):
             raise InputError(
                 f"the training of the {phase.name} diverged at step {phase.steps_done}: its error is {error}; lower "
