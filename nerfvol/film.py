@@ -36,7 +36,11 @@ class Film:
     lod: float = DEFAULT_LOD
 
     def frames(self) -> Iterator[dict[str, Float]]:
-        """The pictures in order; depth is the mean distance of what a pixel sees, normals have unit length."""
+        """The pictures in order, float32 by name: rgb and normal (H, W, 3), others (H, W).
+
+        Depth is the mean distance of what a pixel sees, scene units; normals have unit length. The opacity that it takes to
+        show what was asked for is there too.
+        """
         wanted = {"rgb"}
         for name in self.aov:
             wanted |= {"depth": {"depth", "opacity"}, "normal": {"normal", "opacity"}}.get(name, {name, "opacity"})
@@ -68,7 +72,10 @@ def write_videos(path: Path, film: Film, fps: int) -> list[Path]:
 
 
 def displayable(name: str, image: Mapping[str, Float], depths: tuple[float, float]) -> Float:
-    """An output as values in [0, 1] that a person can read."""
+    """The output ``name`` of ``image`` as values in [0, 1] that a person can read, (H, W) or (H, W, 3).
+
+    ``image``: as of :meth:`Film.frames`; ``depths``: nearest and farthest, scene units.
+    """
     if name in ("depth", "median_depth"):
         return pictures.depth_to_grey(image[name], image["opacity"], *depths)
     if name == "normal":

@@ -43,7 +43,7 @@ def native() -> ModuleType | None:
 
 
 def aligned_empty(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """An uninitialised C-contiguous array that begins on a cache line.
+    """An uninitialised C-contiguous array of this shape, any, that begins on a cache line.
 
     numpy's own begin 16 bytes past one once they are large, so that every row of 64 bytes lies on two lines and each
     load of it costs two. The memory is numpy's all the same, with the large pages it asks the system for.
@@ -55,7 +55,7 @@ def aligned_empty(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any
 
 
 def aligned(array: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-    """``array`` itself where it has the dtype, is C-contiguous and begins on a cache line; else such a copy of it."""
+    """``array`` itself where it has the dtype, is C-contiguous and begins on a cache line; else such a copy. Any shape."""
     if array.dtype == dtype and array.flags.c_contiguous and array.ctypes.data % CACHE_LINE == 0:
         return array
     copy = aligned_empty(array.shape, dtype)

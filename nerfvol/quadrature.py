@@ -36,6 +36,9 @@ def composite(sigmas: Tensor, deltas: Tensor) -> Composite:
     Args:
         sigmas: extinction coefficients (..., n_samples) >= 0, in 1/u.
         deltas: segment lengths, broadcastable to ``sigmas``, in u.
+
+    Returns:
+        ``alphas``, ``trans`` and ``weights`` (..., n_samples), ``trans_final`` (...).
     """
     tau = sigmas * deltas
     inclusive = torch.cumsum(tau, dim=-1)
@@ -55,6 +58,12 @@ def composite_packed(sigmas: Tensor, deltas: Tensor, ray_indices: Tensor, n_rays
         deltas: (n_samples,) in u.
         ray_indices: (n_samples,) int64, not decreasing, each in [0, n_rays).
         n_rays: number of rays; a ray without samples has ``trans_final`` 1.
+
+    Returns:
+        ``alphas``, ``trans`` and ``weights`` (n_samples,), ``trans_final`` (n_rays,).
+
+    Raises:
+        ValueError: sigmas and ray_indices are not both (n_samples,), or ray_indices decrease.
     """
     if sigmas.shape != ray_indices.shape or sigmas.dim() != 1:
         shapes = f"{tuple(sigmas.shape)} and {tuple(ray_indices.shape)}"
@@ -87,6 +96,9 @@ def accumulate(weights: Tensor, values: Tensor, ray_indices: Tensor | None = Non
 
     Returns:
         (..., c) dense, (n_rays, c) packed.
+
+    Raises:
+        ValueError: ray_indices without n_rays.
     """
     weighted = weights.unsqueeze(-1) * values
     if ray_indices is None:
@@ -97,10 +109,11 @@ def accumulate(weights: Tensor, values: Tensor, ray_indices: Tensor | None = Non
 
 
 def median_depth(sigmas: Tensor, t_starts: Tensor, t_ends: Tensor) -> Tensor:
-    """Distance at which the transmittance of a dense ray first falls to 1/2; infinity where it never does.
+    """Distance (...) at which the transmittance of a dense ray first falls to 1/2; infinity where it never does.
 
-    All arguments (..., n_samples), segments in order along the ray. The coefficient is constant inside a segment, so
-    the crossing is exact: the optical depth that is still missing to log 2, divided by sigma.
+    All arguments (..., n_samples), one sample or more, in order along the ray: sigmas in 1/u, t_starts and t_ends in u. The
+    coefficient is constant inside a segment, so the crossing is exact: the optical depth that is still missing to log 2,
+    divided by sigma.
     """
     tau = sigmas * (t_ends - t_starts)
     inclusive = torch.cumsum(tau, dim=-1)

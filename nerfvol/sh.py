@@ -25,7 +25,7 @@ _C4 = (_norm(315, 16), _norm(315, 32), _norm(45, 16), _norm(45, 32), _norm(9, 25
 
 
 def basis_dim(degree: int) -> int:
-    """Number of coefficients of all bands up to ``degree``: (degree + 1)**2."""
+    """Number of coefficients of all bands up to ``degree``: (degree + 1)**2; ValueError unless it is 0 to 4."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"sh degree must be 0 to {MAX_DEGREE}, got {degree}")
     return (degree + 1) ** 2
@@ -41,6 +41,9 @@ def eval_basis(degree: int, dirs: Tensor) -> Tensor:
     Returns:
         (..., (degree + 1)**2) in the type of ``dirs``. Differentiable. Directions are taken as they are: these are
         the harmonics only on the unit sphere.
+
+    Raises:
+        ValueError: another degree, or dirs that are not floating point of shape (..., 3).
     """
     basis_dim(degree)
     if dirs.shape[-1:] != (3,) or not dirs.is_floating_point():
@@ -87,6 +90,9 @@ def eval_colour(sh: Tensor, dirs: Tensor) -> Tensor:
 
     Returns:
         (..., 3).
+
+    Raises:
+        ValueError: sh of another shape, a degree above 4, or dirs as in :func:`eval_basis`.
     """
     degree = math.isqrt(sh.shape[-1]) - 1
     if sh.dim() < 2 or sh.shape[-2] != 3 or (degree + 1) ** 2 != sh.shape[-1]:

@@ -35,7 +35,12 @@ class Calibration:
     resizable: bool = False
 
     def intrinsics(self, width: int, height: int) -> Intrinsics:
-        """The intrinsics of an image of width x height pixels."""
+        """The intrinsics of an image of width x height pixels.
+
+        Raises:
+            InputError: no focal length is stated, a field of view outside (0, pi), an image of another size than is stated
+                unless it may be resized uniformly, or figures that Intrinsics refuses.
+        """
         sx, sy = self._resize(width, height)
         fx = self.fx * sx if self.fx is not None else _focal(self.angle_x, width)
         fy = self.fy * sy if self.fy is not None else _focal(self.angle_y, height)
@@ -80,7 +85,7 @@ _DEFAULT_MODEL = "OPENCV"
 
 
 def read_matrix(value: Any) -> NDArray[np.float64]:
-    """The float64 array of a JSON list of numbers, of whatever shape; InputError where it is none."""
+    """The float64 array of a JSON list of numbers, in the shape of the list; InputError where it is none."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -88,7 +93,11 @@ def read_matrix(value: Any) -> NDArray[np.float64]:
 
 
 def finite_number(data: Mapping[str, Any], *keys: str) -> float | None:
-    """The first of the keys that is there, as a finite number."""
+    """The first of the keys that is there, as a finite number; None where none is.
+
+    Raises:
+        InputError: it is no number, or not below 1e300.
+    """
     for key in keys:
         value = data.get(key)
         if value is None:

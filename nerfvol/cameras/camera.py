@@ -101,7 +101,11 @@ class Intrinsics:
             )
 
     def scaled(self, k: int) -> Intrinsics:
-        """The camera of an image area-averaged over k x k blocks; rows and columns that fill no block are dropped."""
+        """The camera of an image area-averaged over k x k blocks; rows and columns that fill no block are dropped.
+
+        Raises:
+            InputError: k is below 1, or no block fits into the image.
+        """
         if k < 1:
             raise InputError(f"the downscale factor must be a positive integer, got {k}")
         width, height = self.width // k, self.height // k
@@ -110,7 +114,11 @@ class Intrinsics:
         return replace(self, width=width, height=height, fx=self.fx / k, fy=self.fy / k, cx=self.cx / k, cy=self.cy / k)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Intrinsics:
-        """The camera of the part of the image that begins at column ``left`` and row ``top``."""
+        """The camera of the part of the image that begins at column ``left`` and row ``top``; all in pixels.
+
+        Raises:
+            InputError: the part reaches beyond the image.
+        """
         if min(left, top) < 0 or left + width > self.width or top + height > self.height:
             raise InputError(
                 f"{width}x{height} pixels from column {left} and row {top} on are no part of a {self.width}x{self.height} image"
@@ -303,8 +311,9 @@ def orbit(
 ) -> list[Camera]:
     """n cameras evenly spaced on a circle, all looking at its middle.
 
-    ``radius`` is the distance to ``center``, ``elevation_deg`` the angle above the plane through ``center`` normal to
-    ``up`` (-90 < elevation < 90). The first camera's azimuth is toward the world axis least aligned with ``up``.
+    ``center`` (3,) and ``radius``, the distance to it, are in scene units; ``elevation_deg`` is the angle above the plane
+    through ``center`` normal to ``up`` (3,), of any length (-90 < elevation < 90). The first camera's azimuth is toward the
+    world axis least aligned with ``up``.
 
     Raises:
         InputError: no view, no radius, or an elevation at a pole.

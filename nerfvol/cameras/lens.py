@@ -105,6 +105,7 @@ class BrownConrady(Lens):
 
     @property
     def max_angle(self) -> float:
+        """The arctangent of the radius where the radial polynomial turns back; pi / 2 where it never does."""
         return math.atan(self._fold)
 
     @property
@@ -116,6 +117,7 @@ class BrownConrady(Lens):
         return _fold(self._radial)
 
     def distort(self, points: Float) -> Float:
+        """As for :class:`Lens`: points with Z <= 0 are not seen."""
         z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
         plane = points[:, :2] / z[:, None]
         x, y = plane[:, 0], plane[:, 1]
@@ -169,6 +171,7 @@ class Fisheye(Lens):
 
     @property
     def max_angle(self) -> float:
+        """The angle where the polynomial turns back, pi at most."""
         return min(math.pi, _fold(self._radial))
 
     @property
@@ -182,6 +185,7 @@ class Fisheye(Lens):
         return theta * value, value + 2 * s * slope
 
     def distort(self, points: Float) -> Float:
+        """As for :class:`Lens`: every direction has a position, beyond ``max_angle`` a false one; none is NaN."""
         across = np.hypot(points[:, 0], points[:, 1])
         theta = np.arctan2(across, points[:, 2])
         radius = self._radius(theta)[0]

@@ -34,6 +34,7 @@ class BenchOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--sizes", metavar="LIST", help="square picture sizes (default: 400,800,1600)")
     p.add_argument("--repeats", metavar="N", help="the median of N measurements is reported (default: 5)")
@@ -52,7 +53,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: BenchOptions) -> int:
-    """Measure everything, print tables, write JSON where asked."""
+    """Measure everything, print tables, write JSON where asked; the exit code.
+
+    Raises:
+        InputError: options that do not go together, no such model, or a path that cannot be written.
+    """
     if options.ladder is not None:
         return run_ladder(options)
     need("bench", target=options.target)
@@ -193,7 +198,11 @@ def _print_roofline(record: dict[str, Any]) -> None:
 
 
 def run_ladder(options: BenchOptions) -> int:
-    """Train what is not there yet, one after the other, and write what came of it."""
+    """Train what is not there yet, one after the other, and write what came of it; the exit code.
+
+    Raises:
+        InputError: options that do not go together, no such data, or a path that cannot be written.
+    """
     if options.target:
         raise InputError("nerfvol bench takes either RUN|FILE or --ladder DATA, not both")
     need("bench --ladder", ladder=options.ladder, out=options.out)

@@ -37,6 +37,7 @@ class Parser(argparse.ArgumentParser):
     """argparse whose complaints end in one sentence, with a near option for a mistyped one."""
 
     def error(self, message: str) -> NoReturn:
+        """Raises InputError with ``message``, where argparse would print it and end the process."""
         raise InputError(f"{message} (see `{self.prog} --help`)")
 
     def check_leftovers(self, leftovers: Sequence[str]) -> None:
@@ -85,7 +86,11 @@ def add_drawing(p: argparse.ArgumentParser) -> None:
 
 
 def set_threads(threads: int) -> int:
-    """Use ``threads`` CPU threads (0: every core this process may use) in torch and the kernels; returns the number."""
+    """Use ``threads`` CPU threads (0: every core this process may use) in torch and the kernels; returns the number.
+
+    Raises:
+        InputError: fewer than 0.
+    """
     from nerfvol.machine import usable_cores
 
     if threads < 0:

@@ -34,13 +34,18 @@ class DemoOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     p.add_argument("--out", metavar="DIR", help="folder for everything (default: demo)")
     p.add_argument("--time-budget", metavar="TIME", help="for training (default: 150s)")
     p.add_argument("--threads", metavar="N", help="CPU threads (default: all)")
 
 
 def run(options: DemoOptions) -> int:
-    """Do everything in a folder and print where it is."""
+    """Do everything in a folder and print where it is; the exit code.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
     from nerfvol.files.atomic import ensure_writable_folder
     from nerfvol.training.train import train
 

@@ -38,6 +38,7 @@ class EvalOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--data", metavar="DIR", help="posed images to compare with (default: those of the run)")
     p.add_argument("--split", metavar="train|val|test", help="which views (default: val)")
@@ -50,7 +51,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: EvalOptions) -> int:
-    """Prints the scores and writes what the options ask for."""
+    """Prints the scores and writes what the options ask for; the exit code.
+
+    Raises:
+        InputError: no such model or images, or a path that cannot be written.
+    """
     need("eval", target=options.target)
     set_threads(options.threads)
     from nerfvol.datasets.load import load_dataset

@@ -26,6 +26,7 @@ class ExportOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--out", metavar="FILE", help="; ".join(
         f"{' or '.join(row.suffixes)}: {row.name} of {' or '.join(row.kinds)}, opened by {row.opened_by}"
@@ -40,7 +41,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: ExportOptions) -> int:
-    """Writes the file and prints what it is."""
+    """Writes the file and prints what it is; the exit code.
+
+    Raises:
+        InputError: no such model, a format that does not hold it, or a path that cannot be written.
+    """
     need("export", target=options.target, out=options.out)
     target = open_target(options.target)
     choose(options.out, target.model.kind, options.format)

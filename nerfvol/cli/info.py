@@ -20,12 +20,17 @@ class InfoOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     p.add_argument("target", metavar="RUN|FILE", nargs="?", help="model file or run folder; without: this machine")
     p.add_argument("--json", action="store_true", help="print JSON instead of text")
 
 
 def run(options: InfoOptions) -> int:
-    """Print the record, or only the machine's part where no file is named."""
+    """Print the record, or only the machine's part where no file is named; the exit code.
+
+    Raises:
+        InputError: no such model.
+    """
     from nerfvol.kernels import ops
     from nerfvol.machine import describe_hardware
 

@@ -35,6 +35,7 @@ class RenderOptions:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--cameras", metavar="FILE.json", help="camera path: a transforms JSON (docs/cli.md)")
     p.add_argument("--orbit", metavar="N", help="N views on a circle around the scene, as the training cameras stood")
@@ -50,7 +51,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(options: RenderOptions) -> int:
-    """Writes what the options ask for and prints where it is."""
+    """Writes what the options ask for and prints where it is; the exit code.
+
+    Raises:
+        InputError: options that do not go together, no such model or camera path, or a path that cannot be written.
+    """
     need("render", target=options.target, out=options.out)
     if (options.cameras is None) == (options.orbit is None):
         raise InputError("nerfvol render needs either --cameras FILE.json or --orbit N")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
     p.add_argument("--data", metavar="DIR", help=f"{formats_help()}; or a JSON file of transforms itself")
     p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
                    "previews/, checkpoint.safetensors")  # fmt: skip
@@ -44,7 +45,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
 
 
 def run(given: dict[str, Any]) -> int:
-    """Train, and print what came of it."""
+    """Train, and print what came of it; the exit code.
+
+    Raises:
+        InputError: no such data, settings that do not fit, a run that cannot be resumed, or one that fails (see train.train).
+    """
     base = None
     if given.get("resume") and given.get("out"):
         from nerfvol.training.prepare import resumable_config

@@ -40,7 +40,11 @@ def assemble(cls: type[T], *layers: tuple[Mapping[str, Any], str]) -> T:
 
 
 def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The mapping in a YAML file, read with the loader that builds plain values only."""
+    """The mapping in a YAML file, read with the loader that builds plain values only; empty where the file is.
+
+    Raises:
+        InputError: the file cannot be read, is no YAML, or holds something else than keys and values.
+    """
     try:
         document = yaml.safe_load(read_bytes(path).decode("utf-8"))
     except UnicodeDecodeError as error:
@@ -70,7 +74,11 @@ def write_yaml(path: str | os.PathLike[str], settings: Any) -> None:
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
-    """``"octree.sh_degree=2"`` as ``{"octree": {"sh_degree": 2}}``; the value is read as YAML."""
+    """``"octree.sh_degree=2"`` as ``{"octree": {"sh_degree": 2}}``; the value is read as YAML.
+
+    Raises:
+        InputError: it is no KEY=VALUE, or the value is no YAML.
+    """
     key, equals, value = text.partition("=")
     if not equals or not all(part.isidentifier() for part in key.split(".")):
         raise InputError(f"--set expects KEY=VALUE such as octree.sh_degree=2, got {text!r}")

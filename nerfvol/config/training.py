@@ -198,7 +198,7 @@ class OctreeConfig(Checked):
     """Optimiser steps of the whole schedule when no time budget is given."""
     most_epochs: Annotated[float, at_least(0.1)] = 60.0
     """... and when one is given, as many as draw each tile so often at most: a run that comes to them ends early, for more
-    would overfit (docs/performance.md)."""
+    would overfit (docs/experiments.md)."""
     levels: list[Level] = dataclasses.field(default_factory=lambda: [5, 6, 7, 8, 8, 9, 10])
     """Finest level of each stage: level 8 means 256 cells along the inner cube."""
     downscales: list[Downscale] = dataclasses.field(default_factory=lambda: [16, 8, 4, 2, 1, 1, 1])
@@ -217,7 +217,7 @@ class OctreeConfig(Checked):
     sh_degree: Degree | None = None
     """Spherical harmonics of the colours: 0 to 3. None: 1, and 2 in photographs, whose surfaces shine."""
     final_sh_degree: Degree = 1
-    """... in the last stage, where it is more: for shiny scenes. It costs memory and steps (docs/performance.md)."""
+    """... in the last stage, where it is more: for shiny scenes. It costs memory and steps (docs/experiments.md)."""
     foreground_share: Share = 0.8
     """Share of a batch drawn from foreground tiles: those that show more than the background."""
     colour_weight: Weight = 0.06

@@ -20,7 +20,7 @@ _COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
 def seconds(value: Any) -> Any:
-    """A duration in seconds from 120, "120", "120s", "5m", "1.5h"; "none" and None mean no limit."""
+    """A duration in seconds from 120, "120", "120s", "5m", "1.5h"; "none" and None mean no limit. ValueError for others."""
     if value is None or isinstance(value, str) and value.strip().lower() in ("none", "null", ""):
         return None
     text = str(value).strip().lower()
@@ -35,7 +35,10 @@ def seconds(value: Any) -> Any:
 
 
 def colour(value: Any) -> Any:
-    """An RGB colour with components in [0, 1] from "white", "black", "R,G,B" or a list of three numbers."""
+    """An RGB colour with components in [0, 1] from "white", "black", "R,G,B" or a list of three numbers.
+
+    Raises ValueError for others.
+    """
     parts = value.split(",") if isinstance(value, str) else value
     if isinstance(value, str) and value.strip().lower() in _COLOURS:
         return _COLOURS[value.strip().lower()]
@@ -273,7 +276,7 @@ AOVS = ("depth", "median_depth", "opacity", "normal")
 
 
 def image_size(value: Any) -> Any:
-    """(width, height) from "WxH" or a list of two whole numbers; at most 16384 a side."""
+    """(width, height) from "WxH" or a list of two whole numbers, 1 to 16384 pixels a side; ValueError for others."""
     parts = value.lower().replace("×", "x").split("x") if isinstance(value, str) else value
     try:
         size = tuple(int(part) for part in parts)
@@ -285,7 +288,7 @@ def image_size(value: Any) -> Any:
 
 
 def aov_names(value: Any) -> Any:
-    """Names of extra pictures from "depth,normal" or a list."""
+    """Names of extra pictures, of those in AOVS, from "depth,normal" or a list; ValueError for another name."""
     names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
     for name in names:
         if name not in AOVS:
@@ -294,7 +297,7 @@ def aov_names(value: Any) -> Any:
 
 
 def fraction(value: Any) -> Any:
-    """A number in [0, 1)."""
+    """A number in [0, 1); ValueError for another."""
     number = float(value)
     if not 0.0 <= number < 1.0:
         raise ValueError(f"expected a number from 0 (exact) to below 1, got {value!r}")
@@ -302,7 +305,7 @@ def fraction(value: Any) -> Any:
 
 
 def pixels(value: Any) -> Any:
-    """A finite number >= 0."""
+    """A finite number >= 0; ValueError for another."""
     number = float(value)
     if not 0.0 <= number < math.inf:
         raise ValueError(f"expected a number of pixels, 0 (off) or more, got {value!r}")
@@ -310,7 +313,10 @@ def pixels(value: Any) -> Any:
 
 
 def box(value: Any) -> Any:
-    """Two corners from "x0,y0,z0,x1,y1,z1" or a list of six numbers, the first below the second; None stays."""
+    """Two corners from "x0,y0,z0,x1,y1,z1" or a list of six numbers, the first below the second; None stays.
+
+    Raises ValueError for others.
+    """
     if value is None or isinstance(value, str) and value.strip().lower() in ("none", "null", ""):
         return None
     parts = value.split(",") if isinstance(value, str) else value

@@ -43,7 +43,11 @@ def recognises(path: Path) -> bool:
 
 
 def read(folder: Path, split: str) -> Listing:
-    """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken."""
+    """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken.
+
+    Raises:
+        InputError: there is no model, it is damaged or holds no images, or a pose or camera cannot be used.
+    """
     model = find_model(folder)
     if model is None:
         raise InputError(f"{folder}: expected a COLMAP model in sparse/0, but found none")

@@ -111,7 +111,7 @@ def _divide(total: NDArray[np.uint32], by: NDArray[np.uint32] | np.uint32) -> UI
 
 
 def area_average(image: UInt8, k: int) -> UInt8:
-    """The image at 1/k of its size, (h // k, w // k, 3 or 4): colour averaged with its alpha as the weight."""
+    """The image (h, w, 3 or 4) at 1/k of its size, (h // k, w // k, 3 or 4): colour averaged with its alpha as the weight."""
     if k == 1:
         return image
     out = np.empty((image.shape[0] // k, image.shape[1] // k, image.shape[2]), dtype=np.uint8)

@@ -36,7 +36,12 @@ def recognises(path: Path) -> bool:
 
 
 def read(folder: Path, split: str) -> Listing:
-    """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken."""
+    """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken.
+
+    Raises:
+        InputError: the file of poses is damaged, does not have as many as there are images, or holds a pose, lens or range
+            of depths that cannot be used.
+    """
     path = folder / POSES
     rows = _load_rows(path)
     images = image_folder(folder)

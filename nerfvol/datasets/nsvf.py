@@ -35,6 +35,9 @@ def read(folder: Path, split: str) -> Listing:
     """The listing of one split, by the first two letters of the images' names; without such every 8th is held out.
 
     Where only one of validation and test exists it is used for both. ``bbox.txt``, where there is one, is the aabb.
+
+    Raises:
+        InputError: there are no images, one has no pose, or a file of intrinsics, pose or box cannot be used.
     """
     calibration, source = _calibration(folder / INTRINSICS), folder / INTRINSICS
     hint = BoundsHint(aabb=_box(folder / BOX) if (folder / BOX).is_file() else None)

@@ -19,7 +19,7 @@ class ImageStore(Sequence[UInt8]):
         self._count, self._read, self._images = count, read, images
 
     def get(self) -> list[UInt8]:
-        """All images; InputError where the files can no longer be read."""
+        """All images, each uint8 (h, w, 3 or 4); InputError where the files can no longer be read."""
         if self._images is None:
             self._images = self._read()
         return self._images

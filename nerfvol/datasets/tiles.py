@@ -97,7 +97,10 @@ class TileBank:
         return self.batch(np.concatenate(parts), np.concatenate(weights))
 
     def batch(self, tiles: np.ndarray, tile_weights: np.ndarray) -> Batch:
-        """Rays and colours of the given tiles; every ray weighs its tile's weight, padding weighs 0."""
+        """Rays and colours of the ``tiles`` (n,) int, in rising order; padding weighs 0, every other ray its tile's weight.
+
+        tile_weights: (n,) float32. The batch's arrays are float32: rays_o (n, 3), rays_d and target (64 n, 3), weight (64 n,).
+        """
         order = np.argsort(tiles, kind="stable")  # neighbours in one image share the cache
         tiles, tile_weights = tiles[order], tile_weights[order]
         image, tile, row = self.image[tiles], self.tile[tiles], self.row[tiles]

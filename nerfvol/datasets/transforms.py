@@ -31,6 +31,9 @@ def read(path: Path, split: str) -> Listing:
 
     transforms_{train,val,test}.json are used as they are; where only one of val and test exists it is used for both. A
     single transforms.json is split by its own train/val/test_filenames or, without them, by holding out every 8th view.
+
+    Raises:
+        InputError: a file is no such JSON, there is none for the split, or a frame's name, pose or calibration cannot be used.
     """
     if path.is_file():
         return _read_single(path, split)

@@ -1,6 +1,6 @@
 """Exports: one file a format, ``write(model, path, **options) -> bytes written``, and one row in :data:`EXPORTS`.
 
-A writer takes only models of the kinds in its row. ``memory(model, **options)`` beside it says how many bytes writing takes,
+A writer takes only models of the kinds in its row. ``memory(model, **options)`` next to it says how many bytes writing takes,
 and is asked before. Help and error messages are made from the rows. No numpy here: help answers at once.
 """
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Export:
     """name: what ``--format`` calls it; suffixes: ends of file names; module: where ``write`` and ``memory`` are; kinds: models
-    it holds; opened_by: one phrase; options: the names of what ``write`` takes beside model and path."""
+    it holds; opened_by: one phrase; options: the names of what ``write`` takes besides model and path."""
 
     name: str
     suffixes: tuple[str, ...]

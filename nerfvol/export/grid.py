@@ -1,7 +1,7 @@
 """``.npz`` and ``.npy``: an octree's density, or the opacity of a voxel, on a dense grid.
 
 Samples are at the centres of cubic voxels of the box around the leaves, index order x, y, z. An .npz holds ``density`` (or
-``opacity``), ``lo``, ``hi`` and ``voxel_size`` (3,), as the density.npz of a synthetic scene does; beside an .npy stands a
+``opacity``), ``lo``, ``hi`` and ``voxel_size`` (3,), as the density.npz of a synthetic scene does; next to an .npy lies a
 .json of the same name that says the same.
 """
 

@@ -64,13 +64,14 @@ class Domain:
         return torch.stack([center - self.half * self.outer, center + self.half * self.outer])
 
     def scaled(self, positions: Tensor) -> Tensor:
-        """Scene positions in units of the inner cube, which becomes [-1, 1]**3."""
+        """Scene positions (..., 3) in units of the inner cube, which becomes [-1, 1]**3."""
         return (positions - positions.new_tensor(self.center)) / self.half
 
     def contract(self, positions: Tensor) -> Tensor:
-        """Scene positions to [-1, 1]**3, each axis alone: linear in the detail, x -> 2 - 1/x outside (Reiser 2023).
+        """Scene positions (..., 3) to [-1, 1]**3, each axis alone: linear in the inner cube, x -> 2 - 1/x outside.
 
-        With ``outer`` = 1 this is a plain scaling.
+        The contraction of Reiser (2023); with ``outer`` = 1 it is a plain scaling. Positions outside the whole region land
+        on its faces.
         """
         x = self.scaled(positions)
         if self.outer <= 1:
@@ -182,7 +183,7 @@ class NeuralField(nn.Module):
 
     @_in_whole_rows
     def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """(n, 3) -> sigma (n,), sh (n, 3, basis_dim); only with the SH head."""
+        """(n, 3) -> sigma (n,), sh (n, 3, basis_dim); ValueError unless the field has the SH head."""
         if self.shape.head != "sh":
             raise ValueError("this field has a view-dependent rgb head: it has no SH coefficients to give")
         sigma, flat = self._features(positions)
@@ -219,7 +220,11 @@ class HashField(NeuralField):
 
 
 def make_field(domain: Domain, shape: FieldShape, seed: int = 0) -> NeuralField:
-    """The field that ``shape.encoding`` names, its weights drawn from ``seed`` alone, the global RNG left as it was."""
+    """The field that ``shape.encoding`` names, its weights drawn from ``seed`` alone, the global RNG left as it was.
+
+    Raises:
+        ValueError: there is no such encoding.
+    """
     kinds = {"frequency": MLPField, "hash": HashField}
     if shape.encoding not in kinds:
         raise ValueError(f"encoding must be one of {sorted(kinds)}, got {shape.encoding!r}")

@@ -134,7 +134,10 @@ class OccupancyGrid:
         self.sigmas.scatter_reduce_(0, cells, sigmas.detach().float(), "amax")
 
     def probe(self, density: Callable[[Tensor], Tensor], n_points: int, generator: torch.Generator) -> None:
-        """Look at random points of random cells, so that space that was given up can come back."""
+        """Look at ``n_points`` random points of random cells, so that space that was given up can come back.
+
+        ``density``: positions (n, 3), scene units -> coefficients (n,), 1/u.
+        """
         r = self.resolution
         cells = torch.randint(len(self.sigmas), (n_points,), generator=generator)
         cube, inner = cells // r**3, cells % r**3
@@ -197,11 +200,15 @@ class OccupancyGrid:
         return rays, groups
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What is needed to go on: the remembered coefficients and the cells derived from them."""
+        """What is needed to go on, not copied.
+
+        sigmas (n_cubes * resolution**3,) float32, 1/u: the remembered coefficients. What follows from them, bool: occupied, of
+        the same shape, and coarse, of groups of cells.
+        """
         return {"sigmas": self.sigmas, "occupied": self.occupied, "coarse": self.coarse}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Inverse of ``state_dict``; raises InputError for arrays of another size."""
+        """Inverse of ``state_dict``, by copies; InputError where an array has another shape or dtype than this grid's."""
         for name in ("sigmas", "occupied", "coarse"):
             mine, given = getattr(self, name), state[name]
             if mine.shape != given.shape or mine.dtype != given.dtype:

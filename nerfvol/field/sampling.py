@@ -77,6 +77,9 @@ def inverse_cdf(edges: Tensor, weights: Tensor, n_samples: int, generator: torch
 
     Returns:
         (n, n_samples) increasing distances, without a gradient.
+
+    Raises:
+        ValueError: edges do not have one more column than weights.
     """
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(f"edges must have one more column than weights, got {edges.shape[-1]} and {weights.shape[-1]}")

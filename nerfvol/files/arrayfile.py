@@ -32,6 +32,8 @@ _DOCUMENT_KEY = "nerfvol"
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray], document: Mapping[str, Any]) -> int:
     """Write ``arrays`` and the JSON-able ``document`` to the safetensors file ``path`` atomically; returns its bytes.
 
+    Arrays may have any shape; they are written in C order.
+
     Raises:
         InputError: the disk is full or the path not writable.
         ValueError: an array's dtype is not one of safetensors', or ``document`` holds NaN.
@@ -114,7 +116,11 @@ class ArrayFile:
         return found
 
     def read(self, name: str) -> np.ndarray:
-        """The array ``name``: writable memory of its own that outlives the file."""
+        """The array ``name`` in the shape and dtype it was written with: writable memory of its own that outlives the file.
+
+        Raises:
+            InputError: there is no such array, its dtype is not one of numpy's, or it cannot be read.
+        """
         if name not in self.shapes:
             raise self.fault(f"array {name!r} is missing")
         self.dtype(name)

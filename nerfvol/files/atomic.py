@@ -85,6 +85,9 @@ def ensure_writable_folder(path: str | os.PathLike[str]) -> Path:
     """Make the folder ``path`` where it is missing and prove that a file can be written in it.
 
     Done before a long job starts, so that an hour of work is not lost at its first save.
+
+    Raises:
+        InputError: it is a file, cannot be made or not be written into.
     """
     folder = Path(path)
     try:

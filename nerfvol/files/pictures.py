@@ -24,7 +24,7 @@ Float = NDArray[np.float32]
 
 
 def to_uint8(image: Float) -> NDArray[np.uint8]:
-    """Values in [0, 1] (clipped) rounded to 0...255."""
+    """Values in [0, 1] (clipped) rounded to 0...255. Any shape."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
@@ -38,7 +38,7 @@ def write_png(path: str | os.PathLike[str], image: NDArray[Any]) -> None:
 
 
 def srgb_to_linear(image: Float) -> Float:
-    """The sRGB decoding curve (IEC 61966-2-1); negative values keep their sign, values above 1 go on along it."""
+    """The sRGB decoding curve (IEC 61966-2-1); negative values keep their sign, values above 1 go on along it. Any shape."""
     magnitude = np.abs(image)
     curve = np.where(magnitude <= 0.04045, magnitude / 12.92, ((magnitude + 0.055) / 1.055) ** 2.4)
     return (np.sign(image) * curve).astype(np.float32)
@@ -181,7 +181,10 @@ def open_video(path: str | os.PathLike[str], fps: int) -> Iterator[VideoWriter]:
 
 
 def depth_to_grey(depth: Float, opacity: Float, near: float, far: float) -> Float:
-    """Distances as light: 1 at ``near``, 0.1 at ``far``, 0 where nothing was hit (opacity below one half)."""
+    """Distances (H, W) as light (H, W): 1 at ``near``, 0.1 at ``far``, 0 where nothing was hit.
+
+    ``opacity`` (H, W): below one half nothing was hit; near, far: in the unit of ``depth``.
+    """
     nearness = 1.0 - 0.9 * np.clip((depth - near) / max(far - near, 1e-12), 0.0, 1.0)
     return np.where(opacity >= 0.5, nearness, 0.0).astype(np.float32)
 
@@ -198,7 +201,10 @@ def error_map(truth: Float, render: Float, largest: float = 0.25) -> Float:
 
 
 def side_by_side(panels: list[Float], gap: int = 8) -> Float:
-    """Pictures of one height next to each other on white; grey ones become RGB."""
+    """Pictures (H, w) or (H, w, 3) of one height next to each other on white, ``gap`` pixels apart: (H, W, 3).
+
+    Values in [0, 1]; grey pictures become RGB.
+    """
     coloured = [np.repeat(p[..., None], 3, axis=-1) if p.ndim == 2 else p for p in panels]
     white = np.ones((coloured[0].shape[0], gap, 3), np.float32)
     pieces = [piece for panel in coloured for piece in (panel, white)]
@@ -206,7 +212,7 @@ def side_by_side(panels: list[Float], gap: int = 8) -> Float:
 
 
 def stacked(strips: list[NDArray[np.uint8]], gap: int = 8) -> NDArray[np.uint8]:
-    """Pictures of one width below each other, with white between them."""
+    """Pictures (h, W) or (h, W, c) of one width below each other, with ``gap`` rows of white between them."""
     white = np.full((gap, *strips[0].shape[1:]), 255, np.uint8)
     return np.concatenate([piece for strip in strips for piece in (strip, white)][:-1])
 

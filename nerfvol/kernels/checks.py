@@ -13,7 +13,10 @@ from nerfvol.octree.tree import Octree
 
 
 def check_rays(rays_o: ArrayLike, rays_d: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Both as contiguous float32; ValueError where they are no rays as the module's head says, or not finite."""
+    """Both as contiguous float32: directions (n, 3), origins (n, 3) or one for each 64 rays, (ceil(n / 64), 3).
+
+    Raises ValueError where the shapes are others, or a number is not finite.
+    """
     o, d = (np.ascontiguousarray(a, dtype=np.float32) for a in (rays_o, rays_d))
     if d.ndim != 2 or d.shape[1] != 3:
         raise ValueError(f"rays_d must have shape (n, 3), got {d.shape}")
@@ -35,7 +38,10 @@ def check_early_stop(eps: float) -> float:
 
 
 def check_coarse(octree: Octree, origins: np.ndarray, coarse: float) -> float:
-    """``coarse``, or 0 where no node is so small from any of ``origins``; ValueError where it is negative or not finite."""
+    """``coarse``, or 0 where no node is so small from any of the ``origins`` (..., 3).
+
+    Raises ValueError where it is negative or not finite.
+    """
     if not 0 <= coarse < np.inf:
         raise ValueError(f"coarse must be an angle in radians, 0 or more and finite, got {coarse}")
     return float(coarse) if coarse > 0 and lod.has_lod_cut(octree, origins, coarse) else 0.0
@@ -56,7 +62,10 @@ def check_outputs(outputs: Sequence[str]) -> None:
 
 
 def check_batch(batch: Batch, options: LossOptions) -> tuple[np.ndarray, np.ndarray, list[float], float]:
-    """Origins, directions, background and early-stop threshold; ValueError where the parts of the batch do not fit."""
+    """Origins and directions as of :func:`check_rays`, background (three floats) and early-stop threshold.
+
+    Raises ValueError where one of them is not what it should be, target is not (n, 3) or weight not (n,).
+    """
     o, d = check_rays(batch.rays_o, batch.rays_d)
     if batch.target.shape != d.shape or batch.weight.shape != d.shape[:1]:
         raise ValueError(f"target {batch.target.shape} and weight {batch.weight.shape} do not fit rays {d.shape}")

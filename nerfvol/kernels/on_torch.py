@@ -48,7 +48,8 @@ def render_rays(
 ) -> dict[str, np.ndarray]:
     """ops.render_rays on the reference, with arguments that were checked there.
 
-    Where prefiltered nodes are drawn, rays are rendered origin by origin, each on the octree cut as seen from there.
+    o (n, 3) or (ceil(n / 64), 3), d (n, 3): float32; the outputs are (n, 3) or (n,). Where prefiltered nodes are drawn, rays
+    are rendered origin by origin, each on the octree cut as seen from there.
     """
     if coarse == 0 or not len(d):
         return _render_leaves(octree, o, d, bg, eps, outputs)
@@ -128,9 +129,10 @@ def render_values(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Differentiable rendering with vertex rows ``values`` (n_vertices, row) in place of the octree's own.
 
-    Returns rgb (n, 3), transmittance (n,), expected distance (n,); gradients flow to ``values``. float64 values run on
-    the reference, float32 on the compiled kernels where they exist. Raises ValueError as ops.render_rays does, and where
-    the values do not have the octree's shape.
+    rays_o: (n, 3) or (ceil(n / 64), 3); rays_d: (n, 3). Returns rgb (n, 3), transmittance (n,), expected distance (n,);
+    gradients flow to ``values``. float64 values run on the reference, float32 on the compiled kernels where they exist.
+    Raises ValueError where the values do not have the octree's shape, where background or threshold are not what they should
+    be, and, of rays for the kernels, as ops.render_rays does.
     """
     if values.shape != octree.values.shape:
         raise ValueError(f"values must have the octree's shape {octree.values.shape}, got {tuple(values.shape)}")

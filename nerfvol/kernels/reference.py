@@ -95,7 +95,7 @@ class Samples:
 
 
 def explin(raw: Tensor) -> Tensor:
-    """Torch twin of :func:`nerfvol.octree.explin`, differentiable without overflow on the unused side."""
+    """Torch twin of :func:`nerfvol.octree.rows.explin`, any shape; differentiable without overflow on the unused side."""
     return torch.where(raw < 1, torch.exp(raw.clamp(max=1) - 1), raw)
 
 
@@ -210,12 +210,15 @@ def roughness(octree: Octree, values: Tensor, leaf: Tensor) -> tuple[Tensor, Ten
 def loss(
     octree: Octree, values: Tensor, rays_o: Tensor, rays_d: Tensor, target: Tensor, weight: Tensor, options: LossOptions
 ) -> tuple[Tensor, dict[str, Any]]:
-    """The training loss of a batch (see ops.LossOptions) and the squared error per ray.
+    """The training loss of a batch (see ops.LossOptions), a scalar, and a report.
 
     sum_rays weight * ( |C - target|^2 + colour * (sum_i w_i |c_i - target|^2 + T |background - target|^2)
                         + distortion * L_distortion
                         + sum_i length_i / side_i (tv_density * roughness of density + tv_sh * of colour) ),
     distances of the distortion in root cubes; the last sum goes over the leaves that the ray crosses.
+
+    values: (n_vertices, row); rays_o, rays_d, target: (n, 3); weight: (n,). The report has squared_error (n,), a sum over
+    channels, and samples, the :class:`Samples`.
     """
     n = len(rays_o)
     background = torch.tensor(options.background, dtype=values.dtype)

@@ -1,4 +1,4 @@
-"""The operators on splats where no compiled kernels are: the reference, in float32, and Adam beside it."""
+"""The operators on splats where no compiled kernels are: the reference, in float32, and Adam next to it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerfvol.splats.splats import Splats
 def render_splats(
     splats: Splats | PackedSplats, view: SplatView, bg: Sequence[float], eps: float, outputs: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """splat_ops.render_splats on the reference, with arguments that were checked there."""
+    """splat_ops.render_splats on the reference, (H, W[, 3]), with arguments that were checked there."""
     plain = packing.unpack(splats) if isinstance(splats, PackedSplats) else splats
     with torch.no_grad():
         out = splat_reference.render(Parameters.of(plain, torch.float32), view, bg, eps, plain.mode)
@@ -39,6 +39,7 @@ def gradient_rows(
 def loss_gradient(
     state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions
 ) -> tuple[np.ndarray, SplatReport]:
+    """splat_ops.loss_gradient on the reference: (n_blocks, rows, 16) float32; the report is as in :func:`train_step`."""
     rows, parts = gradient_rows(state, view, image, options)
     return packing.to_blocks(rows, np.zeros(rows.shape[1], np.float32)), _report(parts)
 
@@ -50,7 +51,10 @@ def _report(parts: LossParts) -> SplatReport:
 def train_step(
     state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions, rates: SplatRates
 ) -> SplatReport:
-    """splat_ops.train_step on the reference; ``visible`` counts the splats that were hit, entries and blocks are 0."""
+    """splat_ops.train_step on the reference, image (H16, W16, 4) uint8; changes ``state`` in place.
+
+    ``visible`` counts the splats that were hit, entries and blocks are 0.
+    """
     g, parts = gradient_rows(state, view, image, options)
     hit = parts.hit.numpy()
     adam_step(state, g, hit, rates)

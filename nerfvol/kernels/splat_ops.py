@@ -55,7 +55,8 @@ def render_splats(
     Returns float32 arrays for the names in ``outputs``: rgb (H, W, 3) over ``background``, opacity 1 - T (H, W), depth
     sum_i w_i t_i (H, W), median_depth (H, W) the distance where T falls to 1/2 (0 where it does not), normal (H, W, 3)
     the weighted mean of the splats' shortest axes, turned to the viewer. Distances in scene units along the pixel's ray,
-    to the plane through the mean that faces the camera. A pixel ends when T < early_stop_eps; 0 is exact.
+    to the plane through the mean that faces the camera. A pixel ends when T < early_stop_eps; 0 is exact. Raises ValueError
+    where background, threshold or outputs are not what they should be.
     """
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
     if unknown := set(outputs) - set(OUTPUTS):
@@ -72,7 +73,10 @@ def render_splats(
 
 
 def pad_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H16, W16, 4) uint8: ``image`` (H, W, 3 or 4) padded to multiples of 16 by pixels of weight 0; RGB gets weight 255."""
+    """(H16, W16, 4) uint8: ``image`` (H, W, 3 or 4) padded to multiples of 16 by pixels of weight 0; RGB gets weight 255.
+
+    Raises ValueError where the image is not uint8 of that shape.
+    """
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] not in (3, 4) or image.dtype != np.uint8:
         raise ValueError(f"an image must be uint8 (H, W, 3 or 4), got {image.dtype} {image.shape}")

@@ -5,7 +5,7 @@ down, z forward; t = W m + translation):
 
 - slopes u = t_x / t_z, v = t_y / t_z, centre (f_x u + c_x, f_y v + c_y); A = J W R(q) diag(s) with
   J = [[f_x, 0, -f_x u], [0, f_y, -f_y v]] / t_z, for J alone the slopes clamped to the picture and 0.3 half-fields
-  beside it [EWA];
+  next to it [EWA];
 - covariance S = A A^T + 0.3 I in px^2; "mip" opacity o rho, rho = sqrt(det A A^T / det S), at least 0.005
   [Mip-Splatting];
 - alpha = min(0.99, o rho exp(-d^T S^-1 d / 2)) at pixel centres, 0 below 1/255; w = T alpha, T *= 1 - alpha, in the
@@ -47,10 +47,12 @@ class Parameters:
 
     @classmethod
     def of(cls, splats: Splats, dtype: torch.dtype = torch.float64, requires_grad: bool = False) -> Parameters:
+        """A copy of the splats' arrays as tensors of ``dtype``; means stay relative to the splats' origin."""
         arrays = (splats.means, splats.log_scales, splats.quats, splats.logits, splats.sh)
         return cls(*(torch.tensor(a, dtype=dtype, requires_grad=requires_grad) for a in arrays))
 
     def tensors(self) -> tuple[Tensor, ...]:
+        """All five, in the order of the fields."""
         return self.means, self.log_scales, self.quats, self.logits, self.sh
 
 
@@ -264,7 +266,10 @@ def loss(p: Parameters, view: SplatView, image: np.ndarray, options: SplatOption
 def gradients(
     p: Parameters, view: SplatView, image: np.ndarray, options: SplatOptions, mode: str = "mip"
 ) -> tuple[Tensor, ...]:
-    """Of :func:`loss`, by autograd, in the order of Parameters.tensors(); ``p`` must require them."""
+    """Of :func:`loss`, by autograd, each in the shape of its parameter and the order of Parameters.tensors().
+
+    image: (H16, W16, 4) uint8; ``p`` must require gradients.
+    """
     parts = loss(p, view, image, options, mode)
     found = torch.autograd.grad(parts.loss, p.tensors(), allow_unused=True)
     return tuple(torch.zeros_like(a) if g is None else g for a, g in zip(p.tensors(), found, strict=True))

@@ -152,16 +152,25 @@ class SplatState:
         return packing.unpack(self.packed)
 
     def reset_statistics(self) -> None:
+        """Begins again: error, max_weight and seen (n_blocks, 16) are zero."""
         self.error, self.max_weight, self.seen = (self._zeros((len(self.params), LANES)) for _ in range(3))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What a checkpoint keeps: the arrays, not copied, and n, origin, mode as arrays."""
+        """What a checkpoint keeps: the class's arrays, not copied, and n (), origin (3,) and mip () as arrays.
+
+        mip: whether the mode is "mip".
+        """
         head = {"n": np.array(self.n), "origin": self.origin, "mip": np.array(self.mode == "mip")}
         return {name: getattr(self, name) for name in self.ARRAYS} | head
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> SplatState:
-        """The inverse of :meth:`arrays`; ValueError where they do not fit each other."""
+        """The inverse of :meth:`arrays`; copies only what is not float32 on a cache line.
+
+        Raises:
+            ValueError: they do not have the shapes that the class states.
+            KeyError: one is missing.
+        """
         state = cls.__new__(cls)
         state.n, state.origin = int(arrays["n"]), np.asarray(arrays["origin"], np.float64)
         state.mode = "mip" if bool(arrays["mip"]) else "plain"
@@ -193,7 +202,10 @@ class SplatState:
 
     # ------------------------------------------------------------------ which splats there are
     def gather(self, indices: ArrayLike) -> None:
-        """Keeps the splats at ``indices`` (m,) int, in that order and as often as they are named."""
+        """Keeps the splats at ``indices`` (m,) int, in that order and as often as they are named.
+
+        Raises ValueError where an index is outside [0, n), or they are not (m,).
+        """
         index = np.ascontiguousarray(indices, dtype=np.int64)
         if index.ndim != 1 or (len(index) and not 0 <= index.min() <= index.max() < self.n):
             raise ValueError(f"indices must lie in [0, {self.n})")
@@ -206,7 +218,7 @@ class SplatState:
         self.n = len(index)
 
     def prune(self, keep: ArrayLike) -> None:
-        """Keeps the splats where ``keep`` (n,) is true."""
+        """Keeps the splats where ``keep`` (n,) is true; ValueError where it has another shape."""
         mask = np.asarray(keep, bool)
         if mask.shape != (self.n,):
             raise ValueError(f"keep must have shape ({self.n},), got {mask.shape}")

@@ -26,7 +26,11 @@ _BAND = 32  # rows at a time: five maps of a band stay in the processor's cache
 
 
 def psnr(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> float:
-    """-10 log10 of the mean squared error over all pixels and channels, in dB; infinity for equal images."""
+    """-10 log10 of the mean squared error over all pixels and channels, in dB; infinity for equal images.
+
+    Images of one shape, any, with floating-point values in [0, 1]. Raises InputError where shapes differ or are empty, or
+    values are not floating point.
+    """
     a, b = _pair(image, reference)
     error = (a - b).ravel()
     mse = float(np.mean(error * error, dtype=np.float64))
@@ -39,6 +43,9 @@ def ssim(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> float:
     11 x 11 Gaussian window with sigma 1.5, K = (0.01, 0.03), population covariance, the mean over the positions where
     the window lies inside the image and over the channels: scikit-image's structural_similarity(gaussian_weights=True,
     sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=2). Equal images score 1.
+
+    Raises:
+        InputError: images of two shapes, smaller ones, or values that are not floating point.
     """
     a, b = _pair(image, reference)
     if a.ndim != 3 or min(a.shape[:2]) < _WINDOW:

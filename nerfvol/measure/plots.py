@@ -34,7 +34,13 @@ def check_plot(path: str, run_folders: Sequence[str]) -> None:
 
 
 def training_curve(run: str) -> tuple[np.ndarray, np.ndarray, tuple[float, float] | None]:
-    """Seconds and PSNR (running, of training batches) of a run's log; final (seconds, held-out PSNR) where scored."""
+    """Seconds and PSNR, (n,) each, of a run's log; final (seconds, held-out PSNR) where scored, else None.
+
+    The PSNR of the curve is the running one of training batches, dB.
+
+    Raises:
+        InputError: the folder holds no log, or log or scores are damaged.
+    """
     log = Path(run) / run_folder.LOG
     if not log.is_file():
         raise InputError(f"{run} holds no {run_folder.LOG}: it is no run folder")

@@ -61,6 +61,7 @@ class Machine:
 
     @property
     def bandwidth(self) -> float:
+        """The larger of both rates, bytes/s."""
         return max(self.read, self.copy)
 
 
@@ -84,7 +85,11 @@ class Cost:
 
 # ------------------------------------------------------------------ the machine
 def measure_machine(threads: int) -> Machine:
-    """Bandwidth and float32 rate of ``threads`` threads, in a process of its own, where BLAS starts no more of them."""
+    """Bandwidth and float32 rate of ``threads`` threads, in a process of its own, where BLAS starts no more of them.
+
+    Raises:
+        InputError: that process failed.
+    """
     single = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL", "BLIS")} | {
         "VECLIB_MAXIMUM_THREADS": "1"
     }

@@ -78,7 +78,10 @@ def evaluate(
     lod: float = DEFAULT_LOD,
     on_view: Callable[[int, Float, Float], None] | None = None,
 ) -> dict[str, Any]:
-    """:func:`score_views` of ``model``, drawn as ``nerfvol render`` draws it (see models.Model.render)."""
+    """What :func:`score_views` returns of ``model``, drawn as ``nerfvol render`` draws it (see models.Model.render).
+
+    ``background``: (3,) in [0, 1]. ``on_view(index, truth, render)`` sees each pair, both (H, W, 3) float32 in [0, 1].
+    """
 
     def render(camera: Camera) -> Float:
         return model.render(camera, background, ("rgb",), early_stop_eps, lod)["rgb"]
@@ -89,7 +92,10 @@ def evaluate(
 def comparison_writer(
     folder: Path, model: Model, dataset: Dataset, background: Sequence[float], early_stop_eps: float, lod: float
 ) -> Callable[[int, Float, Float], None]:
-    """For :func:`evaluate`'s on_view: writes truth | render | error | depth of each view to ``folder``."""
+    """For :func:`evaluate`'s on_view: writes truth | render | error | depth of each view to ``folder``.
+
+    One PNG a view by its name, H pixels high; truth and render are (H, W, 3) float32 in [0, 1].
+    """
     depths = depth_range(model, dataset.cameras)
 
     def write(index: int, truth: Float, image: Float) -> None:

@@ -28,7 +28,7 @@ def explin(raw: np.ndarray) -> np.ndarray:
 
 
 def explin_inverse(value: np.ndarray) -> np.ndarray:
-    """The raw density whose :func:`explin` is ``value`` > 0."""
+    """The raw density whose :func:`explin` is ``value`` > 0. Any shape."""
     return np.where(value < 1, np.log(np.minimum(value, 1)) + 1, value)
 
 
@@ -45,7 +45,10 @@ def sh_slots(degree: int) -> np.ndarray:
 
 
 def convert_rows(rows: np.ndarray, old_degree: int, new_degree: int) -> np.ndarray:
-    """Packed vertex rows of one SH degree as those of another: missing bands zero, surplus ones dropped."""
+    """Packed vertex rows of one SH degree as those of another: missing bands zero, surplus ones dropped.
+
+    (n, 16 * BLOCKS[old_degree]) -> (n, 16 * BLOCKS[new_degree]), a new array of the same dtype.
+    """
     out = aligned_empty((len(rows), 16 * BLOCKS[new_degree]), rows.dtype)
     out[:] = 0
     k = (min(old_degree, new_degree) + 1) ** 2

@@ -1,6 +1,6 @@
 """From leaves to an octree's arrays: child masks, the numbering of corners, and how rows follow a change of topology.
 
-The conventions are nerfvol.octree's; what takes long has a compiled twin in kernels/csrc/topology.cpp. Arrays that live
+The conventions are octree/tree.py's; what takes long has a compiled twin in kernels/csrc/topology.cpp. Arrays that live
 as long as an octree are as narrow as they can be: levels int8, positions int32; arithmetic that could leave them is int64.
 """
 
@@ -86,7 +86,10 @@ LATTICE_OF_CORNER = (OFFSETS[:, None] + OFFSETS) @ LATTICE_STRIDES  # (child, co
 
 
 def build_masks(level: np.ndarray, ijk: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Breadth-first masks of the octree with these leaves."""
+    """Breadth-first node_mask, leaf_mask (n_nodes,) uint8 of the octree with these leaves, in any order.
+
+    level (n,), ijk (n, 3): whole numbers. Raises InputError where leaves overlap.
+    """
     node_masks, leaf_masks = [], []
     nodes_below = np.empty(0, dtype=np.int64)  # Morton codes of interior nodes one level down
     for above in range(int(level.max()) - 1, -1, -1):
@@ -124,7 +127,10 @@ def pruned_masks(node_mask: np.ndarray, leaf_mask: np.ndarray, keep: np.ndarray)
 
 
 def level_starts(node_mask: np.ndarray) -> list[int]:
-    """Where the nodes of each level begin, from the root's, and behind them where the last level ends."""
+    """Where the nodes of each level begin, from the root's, and behind them where the last level ends.
+
+    node_mask: (n_nodes,) uint8; one number more than there are levels of nodes, the first 0, the last n_nodes.
+    """
     starts = [0, 1]
     while starts[-1] < len(node_mask):
         starts.append(starts[-1] + int(POPCOUNT[node_mask[starts[-2] : starts[-1]]].sum()))

@@ -105,18 +105,22 @@ class Octree:
     # ------------------------------------------------------------------ sizes and places
     @property
     def n_nodes(self) -> int:
+        """Interior nodes, the root among them."""
         return len(self.node_mask)
 
     @property
     def n_leaves(self) -> int:
+        """Leaves."""
         return len(self.corners)
 
     @property
     def n_vertices(self) -> int:
+        """Distinct corners of leaves: the rows of ``values``."""
         return self._n_vertices
 
     @property
     def max_level(self) -> int:
+        """Level of the finest leaves, 1 to 16."""
         return int(self.leaf_level.max())
 
     def leaf_sizes(self) -> np.ndarray:
@@ -203,7 +207,11 @@ class Octree:
 
     # ------------------------------------------------------------------ changes of topology
     def prune(self, keep: ArrayLike) -> tuple[Octree, Transfer]:
-        """Keeps the leaves where ``keep`` (n_leaves,) is true; the field inside them does not change."""
+        """Keeps the leaves where ``keep`` (n_leaves,) is true; the field inside them does not change.
+
+        Returns a new octree, and how rows per vertex and leaf follow. Raises InputError where ``keep`` has another length, or
+        no leaf would stay.
+        """
         stays = np.asarray(keep, dtype=bool).reshape(-1)
         if len(stays) != self.n_leaves:
             raise InputError(f"keep must have one entry per leaf ({self.n_leaves}), got {len(stays)}")
@@ -220,6 +228,9 @@ class Octree:
 
         New vertices take the trilinear value of the leaf they came from, so the field is the same, save where a new
         vertex coincides with one that a finer neighbour already owned: that vertex keeps its value.
+
+        Returns a new octree, and how rows per vertex and leaf follow. Raises InputError where ``mask`` has another length, or a
+        leaf of the finest level there is, 16, would be split.
         """
         splits = np.asarray(mask, dtype=bool).reshape(-1)
         if len(splits) != self.n_leaves:

@@ -37,10 +37,12 @@ class PackedSplats:
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the colours' spherical harmonics."""
         return math.isqrt(self.basis) - 1
 
 
 def n_blocks(n: int) -> int:
+    """Blocks of 16 lanes that ``n`` splats take; the last one may have free lanes."""
     return -(-n // LANES)
 
 

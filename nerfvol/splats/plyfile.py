@@ -138,7 +138,11 @@ class PlyFile:
             )
 
     def read(self) -> dict[str, NDArray]:
-        """The vertices' properties by name, each an array (count,) of native byte order."""
+        """The vertices' properties by name, each an array (count,) of native byte order.
+
+        Raises:
+            InputError: the file cannot be read, is shorter than its header says, or holds other things than its numbers.
+        """
         try:
             self._file.seek(self._rows_at)
             return self._read_text() if self.format == "ascii" else self._read_binary()

@@ -49,10 +49,12 @@ class Splats:
 
     @property
     def n(self) -> int:
+        """Number of splats."""
         return len(self.means)
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the colours' spherical harmonics."""
         return math.isqrt(self.sh.shape[-1]) - 1
 
     def validate(self) -> Splats:
@@ -76,7 +78,7 @@ class Splats:
         return self
 
     def with_sh_degree(self, degree: int) -> Splats:
-        """The same splats with more bands (zero) or fewer."""
+        """The same splats with more bands (zero) or fewer; InputError where splats have no such degree."""
         if not 0 <= degree <= MAX_DEGREE:
             raise InputError(f"splats have harmonics of degree 0 to {MAX_DEGREE}, got {degree}")
         coefficients = (degree + 1) ** 2
@@ -113,7 +115,11 @@ class Splats:
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
-    """All splats of ``parts`` about the first one's origin, with as many bands as the richest; the mode must be one."""
+    """All splats of ``parts`` about the first one's origin, with as many bands as the part that has most.
+
+    Raises:
+        InputError: there are no parts, or they differ in mode.
+    """
     if not parts:
         raise InputError("there are no splats to concatenate")
     modes = sorted({part.mode for part in parts})

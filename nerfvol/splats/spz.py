@@ -27,7 +27,7 @@ _FLAGS_AT = 14
 _MIP = 1
 _SMALLEST_ROW = 19  # bytes of a Gaussian of degree 0 once unpacked, version 2
 _LARGEST_RATIO = 1032  # of deflate
-_POSITION_BITS = 23  # beside the sign
+_POSITION_BITS = 23  # besides the sign
 _SHORTEST = 1e-12
 
 

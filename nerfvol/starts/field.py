@@ -185,6 +185,9 @@ def candidate_cells(
 
     Where they do not fit, all leaves are made coarser: they hold all of a haze, and the octree's training splits them where
     that pays. Only where the coarsest do not fit either, the thinnest are left out.
+
+    Raises:
+        InputError: nothing in the field is opaque enough for a leaf.
     """
     level, threshold = cast(int, config.level), -math.log1p(-config.empty_opacity)
     start = max(1, config.coarse_level + frame.finest - level)
@@ -270,6 +273,9 @@ def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int =
 
     With 8 samples a vertex is the mean over the middles of the eight cells around it, of half the size of the finest
     leaf that has the vertex; colour is weighted by the coefficient, so that space in front of a surface has its colour.
+
+    Raises:
+        ValueError: samples_per_vertex is neither 1 nor 8.
     """
     if samples_per_vertex not in (1, 8):
         raise ValueError(f"samples_per_vertex must be 1 or 8, got {samples_per_vertex}")

@@ -101,7 +101,10 @@ def plane_sweep(
 
 
 def depth_maps(views: Sequence[SweepView], near: float, far: float) -> list[DepthMap]:
-    """Depth maps of at most 64 views, evenly chosen, between the depths ``near`` and ``far`` along their axes."""
+    """Depth maps of at most 64 views, evenly chosen, between the depths ``near`` and ``far`` along their axes.
+
+    Depths in scene units. Raises ValueError unless 0 < near < far.
+    """
     if not 0 < near < far:
         raise ValueError(f"expected depths with 0 < near < far, got {near} and {far}")
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_REFERENCES)).round().astype(int))

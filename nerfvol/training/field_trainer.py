@@ -30,7 +30,11 @@ if TYPE_CHECKING:
 
 
 def domain_of(scene: SceneBounds) -> Domain:
-    """The inner cube around the scene's bounds, and the background cube around it where there is one."""
+    """The inner cube around the scene's bounds, and the background cube around it where there is one.
+
+    Raises:
+        InputError: the bounds are no box of positive, finite size.
+    """
     aabb = np.asarray(scene.aabb, dtype=np.float64)
     center, half = aabb.mean(0), float((aabb[1] - aabb[0]).max() / 2)
     if not (math.isfinite(half) and half > 0):
@@ -254,7 +258,10 @@ class FieldTrainer:
 
     # ------------------------------------------------------------------ training
     def find_samples(self, rays_o: Tensor, rays_d: Tensor, generator: torch.Generator | None = None) -> Samples:
-        """Where to look along rays; jittered with a generator, the middles without."""
+        """Where to look along rays_o, rays_d (n, 3), scene units and unit directions: packed samples.
+
+        Jittered with a generator, the middles without.
+        """
         near_plane = NEAREST * self.domain.half if self.domain.outer > 1 else 0.0
         if self.config.sampler == "importance":
             near, far = intersect_aabb(rays_o, rays_d, self.domain.aabb)
@@ -269,7 +276,10 @@ class FieldTrainer:
         return OccupiedField(self.field, self.grid) if self.config.sampler == "occupancy" else self.field
 
     def render(self, rays_o: Tensor, rays_d: Tensor, chunk: int = 4096) -> dict[str, Tensor]:
-        """``render_field`` of the field as it is now."""
+        """``render_field`` of the field as it is now: rgb (n, 3), opacity (n,), depth (n,).
+
+        rays_o: (n, 3) or (3,), rays_d: (n, 3) unit; ``chunk`` rays at a time.
+        """
         return render_field(self.field, rays_o, rays_d, self.background.tolist(), self.find_samples, chunk)
 
     def step(self, progress: float | None = None) -> FieldReport:

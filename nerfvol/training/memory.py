@@ -141,7 +141,10 @@ def estimate_training(
 
 
 def require_memory(estimate: MemoryEstimate, available: int | None = None) -> None:
-    """Refuse a run that cannot fit, with what to try. ``available`` defaults to what the machine has free."""
+    """Refuse a run that cannot fit, by an InputError that says what to try.
+
+    ``available``: bytes; by default what the machine has free.
+    """
     free = available_memory() if available is None else available
     if free is not None and estimate.peak > SHARE * free:
         raise InputError(

@@ -152,7 +152,11 @@ class OctreeTrainer:
         }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
-        """Continues from :meth:`state_dict` as if nothing had happened."""
+        """Continues from :meth:`state_dict` as if nothing had happened.
+
+        Raises:
+            InputError: its arrays do not fit each other.
+        """
         octree = Octree(
             state["node_mask"], state["leaf_mask"], origin=state["origin"], size=state["size"],
             sh_degree=state["sh_degree"], density_scale=state["density_scale"],
@@ -301,7 +305,10 @@ class OctreeTrainer:
         self.state.reset_statistics(self.octree.n_leaves)
 
     def prune(self) -> tuple[np.ndarray, np.ndarray]:
-        """Removes leaves that no ray needed; error and footprint of those that stay."""
+        """Removes leaves that no ray needed; error and footprint of those that stay, (n_leaves,) each.
+
+        Raises InputError where none would stay.
+        """
         keep = self._needed(self.config.prune_weight)
         if not keep.any():
             raise InputError(

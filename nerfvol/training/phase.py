@@ -13,33 +13,40 @@ from nerfvol.models import Model
 
 
 class Phase(Protocol):
-    """What a run asks of a trainer.
-
-    name: "field", "octree". rates: the settings to lower where it diverges. steps: of the whole schedule without a time
-    budget. most_steps: at which a run with a budget ends early. previews: moments of progress at which a picture of
-    ``preview_width`` pixels is written.
-    """
+    """What a run asks of a trainer; ``steps_done`` are its own optimiser steps, ``stage`` its resolution step, from 0."""
 
     steps_done: int
     stage: int
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """One of ``field``, ``octree`` and ``splats``."""
+        ...
 
     @property
-    def rates(self) -> str: ...
+    def rates(self) -> str:
+        """The settings to lower where it diverges, as a sentence names them."""
+        ...
 
     @property
-    def steps(self) -> int: ...
+    def steps(self) -> int:
+        """Optimiser steps of the whole schedule without a time budget."""
+        ...
 
     @property
-    def most_steps(self) -> float: ...
+    def most_steps(self) -> float:
+        """Steps at which a run with a time budget ends early; infinity: at none."""
+        ...
 
     @property
-    def previews(self) -> Sequence[float]: ...
+    def previews(self) -> Sequence[float]:
+        """Moments of progress in [0, 1] at which a picture is written."""
+        ...
 
     @property
-    def preview_width(self) -> int: ...
+    def preview_width(self) -> int:
+        """Width of that picture, pixels."""
+        ...
 
     @property
     def stages_left(self) -> int:

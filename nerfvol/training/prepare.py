@@ -34,7 +34,7 @@ _FREE = {"data", "out", "time_budget", "threads", "resume", "checkpoint_every", 
 
 # ------------------------------------------------------------------ the folder
 def resumable_config(run: str | os.PathLike[str]) -> Path:
-    """RUN/config.yaml of a run that can be resumed."""
+    """RUN/config.yaml of a run that can be resumed; InputError where it or the checkpoint is missing."""
     config, checkpoint = Path(run) / CONFIG, Path(run) / CHECKPOINT
     for path in (config, checkpoint):
         if not path.is_file():

@@ -57,11 +57,16 @@ class Clock:
         self._zero = (now - process_seconds() if started is None else started) - spent
 
     def elapsed(self) -> float:
+        """Seconds so far, those of earlier sessions included."""
         return time.perf_counter() - self._zero
 
 
 def read_saved(path: Path) -> dict[str, Any]:
-    """The state in a run's checkpoint, with everything that a continuation looks up in it."""
+    """The state in a run's checkpoint, with everything that a continuation looks up in it.
+
+    Raises:
+        InputError: there is no such file, it is damaged, or no checkpoint of a training run.
+    """
     state = load_checkpoint(path)
     phase = state.get("phase")
     needed = {"steps"} if phase == "done" else set(_STATE)
@@ -99,7 +104,11 @@ class Run:
         self._last_save = time.perf_counter()
 
     def enter(self, phase: Phase) -> None:
-        """Begin the phase, or go on inside it where the checkpoint was written in it."""
+        """Begin the phase, or go on inside it where the checkpoint was written in it.
+
+        Raises:
+            InputError: what the checkpoint holds does not fit the phase.
+        """
         resumed = self.saved["phase"] == phase.name
         if resumed:
             try:
@@ -120,6 +129,7 @@ class Run:
         return None if budget is None else max(0.0, budget - self._reserve - self.clock.elapsed())
 
     def phase_seconds(self) -> float:
+        """Seconds of wall clock since the present phase began, over all sessions."""
         return self.clock.elapsed() - self.phase_started
 
     def progress(self, phase: Phase) -> float:
@@ -132,7 +142,7 @@ class Run:
         return max(self.phase_seconds() / share, phase.steps_done / phase.most_steps) if share > 0 else 1.0
 
     def follow(self, phase: Phase, error: float) -> None:
-        """Keep the running error; a number that is none ends the run before it reaches a checkpoint."""
+        """Keep the running error; InputError where it is no number, before the run reaches a checkpoint."""
         if not math.isfinite(error):
             raise InputError(
                 f"the training of the {phase.name} diverged at step {phase.steps_done}: its error is {error}; lower "
@@ -185,6 +195,7 @@ class Run:
             self._log = None
 
     def checkpoint_due(self) -> bool:
+        """Whether the last checkpoint, or the start of this session, is ``checkpoint_every`` seconds ago."""
         return time.perf_counter() - self._last_save >= self.config.checkpoint_every
 
     def save(self, phase: Phase) -> None:
@@ -239,6 +250,7 @@ class Run:
             signal.signal(signal.SIGINT, before)
 
     def interruption(self, phase: Phase) -> KeyboardInterrupt:
+        """What to raise once a checkpoint was written after Ctrl-C; says where the run is and how to go on."""
         place = f"step {phase.steps_done} of the {phase.name}"
         self.say(f"saved at {place}; to go on: nerfvol train --resume --out {self.folder}")
         return KeyboardInterrupt()

@@ -1,6 +1,6 @@
 """How many Gaussians, at which size of the photographs and when: what the seconds of a run can pay for.
 
-Measured on two cores (docs/performance.md): small sizes first, for a step at an eighth of the size costs a twentieth and
+Measured on two cores (docs/experiments.md): small sizes first, for a step at an eighth of the size costs a twentieth and
 teaches the same; growth early, for a Gaussian must still be optimised; and no more of them than the seconds can optimise.
 """
 

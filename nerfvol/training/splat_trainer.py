@@ -76,7 +76,7 @@ class SplatTrainer:
         return SplatModel(self.state.packed, self.metadata()).render(camera, self.background)["rgb"]
 
     def metadata(self) -> dict[str, Any]:
-        """What drawing needs beside the splats."""
+        """What drawing needs besides the splats."""
         return {"near": NEAR_SHARE * self.subject_distance}
 
     def size(self) -> str:
