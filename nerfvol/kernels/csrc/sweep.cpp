@@ -38,7 +38,7 @@ NERFVOL_INLINE void warp_row(const Picture& to, const float* map, float w, int y
     const int stride = to.width, most_x = std::max(to.width - 2, 0), most_y = std::max(to.height - 2, 0);
     const int dx = to.width > 1 ? 1 : 0, dy = to.height > 1 ? stride : 0;
     const float *grey = to.grey, *solid = to.solid;
-#pragma GCC ivdep
+    NERFVOL_APART
     for (int x = 0; x < width; ++x) {
         const float fx = float(x) + 0.5f;
         const float z = map[6] * fx + z0;
@@ -66,14 +66,14 @@ NERFVOL_INLINE void warp_row(const Picture& to, const float* map, float w, int y
 
 // out[x] = the sum of in[x] ... in[x + 6], where in begins kRadius before the row.
 NERFVOL_INLINE void sum_of_seven(const float* in, int width, float* out) {
-#pragma GCC ivdep
+    NERFVOL_APART
     for (int x = 0; x < width; ++x)
         out[x] = ((in[x] + in[x + 1]) + (in[x + 2] + in[x + 3])) + ((in[x + 4] + in[x + 5]) + in[x + 6]);
 }
 
 // Adds (sign 1) or takes off (-1) a row from the column sums of b, b^2 and a b.
 NERFVOL_INLINE void add_row(const float* a, const float* b, int width, float sign, float* s1, float* s2, float* s3) {
-#pragma GCC ivdep
+    NERFVOL_APART
     for (int x = 0; x < width; ++x) {
         const float sb = sign * b[x];
         s1[x] += sb;
@@ -122,7 +122,7 @@ NERFVOL_INLINE void correlate(const float* b, int height, int width, Workspace& 
         float *first = s.first.data() + row, *second = s.second.data() + row;
         const float* across = s.count.data();
         const float down = window(y, height);
-#pragma GCC ivdep
+    NERFVOL_APART
         for (int x = 0; x < width; ++x) {
             const float n = across[x] * down;
             const float variance = std::max(sbb[x] - sb[x] * sb[x] / n, 0.0f) + kFloor;
@@ -160,13 +160,13 @@ NERFVOL_INLINE void prepare(const Picture& picture, Workspace& s) {
 // Takes the scores of plane number `plane` into the best one's record.
 NERFVOL_INLINE void record(int plane, int others, int apart, size_t n, Workspace& s) {
     const bool alone = others < 2;
-#pragma GCC ivdep
+    NERFVOL_APART
     for (size_t i = 0; i < n; ++i) {
         const float two = s.second[i] > -1.0f ? 0.5f * (s.first[i] + s.second[i]) : -1.0f;  // both must see the pixel
         const float score = alone ? s.first[i] : two;
         const bool better = score > s.best[i], next = s.at[i] == plane - 1 && plane > 0, far = plane - s.at[i] >= apart;
         const float lesser = better ? s.best[i] : score;  // the best so far is a rival of what beats it from afar
-        s.rival[i] = far & (lesser > s.rival[i]) ? lesser : s.rival[i];
+        s.rival[i] = (far & (lesser > s.rival[i])) ? lesser : s.rival[i];
         s.after[i] = better ? -1.0f : next ? score : s.after[i];
         s.before[i] = better ? s.previous[i] : s.before[i];
         s.at[i] = better ? plane : s.at[i];

@@ -87,7 +87,7 @@ NERFVOL_INLINE void place_row(const Bytes& s, const PositionGrid& g, const float
     int32_t *to_x = out.x.data(), *to_y = out.y.data();
     float *to_u = out.u.data(), *to_v = out.v.data();
     uint8_t* inside = out.inside.data();
-#pragma GCC ivdep
+    NERFVOL_APART
     for (int32_t x = 0; x < width; ++x) {
         const float at = float(x) * per_node;
         const int32_t i = std::min(int32_t(at), last);
