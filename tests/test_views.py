@@ -284,6 +284,21 @@ def test_orbit_of_forward_facing_and_outward_cameras_uses_the_box():
     assert describe_orbit(outward, [[-1, -1, -1], [1, 1, 3]])["center"] == [0, 0, 1]
 
 
+def test_cameras_on_one_side_sway_there_and_back_within_their_arc():
+    full = orbit(36, center=(0, 0, 0), radius=3.0, elevation_deg=20, intrinsics=lens_of(40, 40))
+    seen = [*full[1:6], full[0], *full[-5:]]  # 50 degrees to each side of the first
+    found = describe_orbit(seen, [[-1, -1, -1], [1, 1, 1]])
+    assert abs(found["azimuth_deg"]) < 1e-6 and 80 <= found["arc_deg"] <= 100
+    path = orbit_cameras(40, found, None)
+    away = np.degrees([math.acos(np.clip(c.position[:2] @ full[0].position[:2] / (3 * math.cos(math.radians(20))) ** 2, -1, 1))
+                       for c in path])  # fmt: skip
+    assert away.max() == pytest.approx(found["arc_deg"] / 2, abs=1e-6) and away[0] < 1e-6
+    assert np.linalg.norm(path[-1].position - path[0].position) < 0.5  # a loop
+    assert "arc_deg" not in describe_orbit(full, [[-1, -1, -1], [1, 1, 1]])
+    above = [Camera(lens_of(40, 40), look_at((0, 0, 0), (math.cos(a), math.sin(a), 0.1))) for a in range(6)]
+    assert "arc_deg" not in describe_orbit(above, [[-1, -1, -1], [1, 1, 3]])  # they look outwards
+
+
 def test_default_orbit_shows_the_whole_box():
     box = np.array([[-1.0, -2.0, 0.0], [3.0, 1.0, 1.0]])
     corners = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])

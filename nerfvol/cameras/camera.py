@@ -300,6 +300,17 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
     return pose
 
 
+def orbit_axes(up: ArrayLike) -> tuple[Float, Float, Float]:
+    """Unit vectors (3,) of an orbit about ``up`` (3,), of any length: the axis, azimuth 0 and azimuth 90 degrees."""
+    axis: Float = np.asarray(up, dtype=np.float64)
+    axis = axis / np.linalg.norm(axis)
+    start: Float = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    start = start - axis * float(start @ axis)
+    start = start / np.linalg.norm(start)
+    side: Float = np.cross(axis, start)
+    return axis, start, side
+
+
 def orbit(
     n: int,
     *,
@@ -308,12 +319,13 @@ def orbit(
     elevation_deg: float,
     intrinsics: Intrinsics,
     up: Sequence[float] = (0.0, 0.0, 1.0),
+    azimuths: ArrayLike | None = None,
 ) -> list[Camera]:
-    """n cameras evenly spaced on a circle, all looking at its middle.
+    """n cameras evenly spaced on a circle, or at ``azimuths`` (n,), radians, all looking at its middle.
 
     ``center`` (3,) and ``radius``, the distance to it, are in scene units; ``elevation_deg`` is the angle above the plane
-    through ``center`` normal to ``up`` (3,), of any length (-90 < elevation < 90). The first camera's azimuth is toward the
-    world axis least aligned with ``up``.
+    through ``center`` normal to ``up`` (3,), of any length (-90 < elevation < 90). Azimuth 0, the first camera's on a
+    circle, is toward the world axis least aligned with ``up``.
 
     Raises:
         InputError: no view, no radius, or an elevation at a pole.
@@ -323,15 +335,11 @@ def orbit(
             f"an orbit needs at least one view, a positive radius and an elevation between -90 and 90 degrees, "
             f"got {n}, {radius:g} and {elevation_deg:g}"
         )
-    middle, axis = np.asarray(center, dtype=np.float64), np.asarray(up, dtype=np.float64)
-    axis = axis / np.linalg.norm(axis)
-    start = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    start = start - axis * (start @ axis)
-    start /= np.linalg.norm(start)
-    side = np.cross(axis, start)
+    middle = np.asarray(center, dtype=np.float64)
+    axis, start, side = orbit_axes(up)
     elevation = math.radians(elevation_deg)
     cameras = []
-    for azimuth in 2 * math.pi * np.arange(n) / n:
+    for azimuth in 2 * math.pi * np.arange(n) / n if azimuths is None else np.asarray(azimuths, np.float64):
         outward = math.cos(azimuth) * start + math.sin(azimuth) * side
         eye = middle + radius * (math.cos(elevation) * outward + math.sin(elevation) * axis)
         cameras.append(Camera(intrinsics, look_at(eye, middle, axis)))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.calibration import Calibration, lens_keys, read_calibration, read_matrix
-from nerfvol.cameras.camera import Camera, Intrinsics, orbit
+from nerfvol.cameras.camera import Camera, Intrinsics, orbit, orbit_axes
 from nerfvol.cameras.focus import focus_point
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json
@@ -23,6 +23,8 @@ from nerfvol.files.atomic import read_json
 DEFAULT_SIZE = (800, 800)
 DEFAULT_ANGLE_X = 0.6911
 """Horizontal field of view, radians (40 degrees), where a file states none: that of the NeRF-synthetic scenes."""
+ONE_SIDE = 120.0
+"""Degrees: cameras within such an arc have seen one side of the scene."""
 LARGEST_SIDE = 16384
 
 
@@ -80,7 +82,8 @@ def describe_orbit(cameras: Sequence[Camera], aabb: Any) -> dict[str, Any]:
     """The orbit that continues the training cameras, JSON-able, for the octree's metadata (key "orbit").
 
     The centre is the point nearest to all viewing axes where those meet (photographs taken around something), else
-    the middle of ``aabb`` (2, 3); radius and elevation are the medians over the cameras; up is their mean up.
+    the middle of ``aabb`` (2, 3); radius and elevation are the medians over the cameras; up is their mean up. Where all
+    cameras stand on one side, "azimuth_deg" and "arc_deg" say where and how wide: nothing is known of the other sides.
     """
     positions = np.stack([camera.position for camera in cameras])
     box = np.asarray(aabb, dtype=np.float64)
@@ -99,17 +102,43 @@ def describe_orbit(cameras: Sequence[Camera], aabb: Any) -> dict[str, Any]:
     return {
         "center": center.tolist(), "radius": radius, "elevation_deg": float(np.clip(elevation, -80.0, 80.0)),
         "up": up.tolist(), "camera_angle_x": 2.0 * math.atan(0.5 * lens.width / lens.fx),
-        "size": [lens.width, lens.height],
+        "size": [lens.width, lens.height], **_arc(cameras, offsets, up),
     }  # fmt: skip
 
 
+def _arc(cameras: Sequence[Camera], offsets: np.ndarray, up: np.ndarray) -> dict[str, float]:
+    """Middle and width, degrees, of the arc that holds all cameras but one in ten, seen from the orbit's centre.
+
+    offsets: (n, 3) from the centre to the cameras. Empty where they stand on more than one side, or do not look at the centre.
+    """
+    _, start, side = orbit_axes(up)
+    across, along = offsets @ side, offsets @ start
+    inward = [
+        camera.forward @ -offset > 0.5 * np.linalg.norm(offset) for camera, offset in zip(cameras, offsets, strict=True)
+    ]
+    if np.mean(inward) < 0.9 or np.median(np.hypot(across, along)) < 0.2 * np.median(np.linalg.norm(offsets, axis=1)):
+        return {}
+    angle = np.arctan2(across, along)
+    middle = math.atan2(np.sin(angle).mean(), np.cos(angle).mean())
+    apart = np.abs((angle - middle + np.pi) % (2 * np.pi) - np.pi)
+    width = 2 * math.degrees(float(np.quantile(apart, 0.9)))
+    return {"azimuth_deg": math.degrees(middle), "arc_deg": width} if len(offsets) > 2 and width < ONE_SIDE else {}
+
+
 def orbit_cameras(count: int, description: Mapping[str, Any], size: tuple[int, int] | None) -> list[Camera]:
-    """``count`` cameras on the orbit of :func:`describe_orbit` (missing keys: see :func:`default_orbit`)."""
+    """``count`` cameras on the orbit of :func:`describe_orbit` (missing keys: see :func:`default_orbit`).
+
+    A full circle; where the description has an arc, they sway within it, there and back.
+    """
     width, height = size or tuple(description.get("size") or DEFAULT_SIZE)
     focal = 0.5 * width / math.tan(0.5 * float(description.get("camera_angle_x", DEFAULT_ANGLE_X)))
     lens = Intrinsics(int(width), int(height), focal, focal, 0.5 * width, 0.5 * height)
+    azimuths = None
+    if "arc_deg" in description:
+        sway = 0.5 * float(description["arc_deg"]) * np.sin(2 * np.pi * np.arange(count) / max(count, 1))
+        azimuths = np.radians(float(description.get("azimuth_deg", 0.0)) + sway)
     return orbit(
-        count, center=description["center"], radius=float(description["radius"]),
+        count, azimuths=azimuths, center=description["center"], radius=float(description["radius"]),
         elevation_deg=float(description["elevation_deg"]), intrinsics=lens, up=description.get("up", (0.0, 0.0, 1.0)),
     )  # fmt: skip
 

@@ -73,7 +73,10 @@ def run(options: RenderOptions) -> int:
     if options.cameras is not None:
         cameras = load_cameras(options.cameras, options.size)
     else:
-        cameras = orbit_cameras(options.orbit or 1, target.orbit(), options.size)
+        orbit = target.orbit()
+        if "arc_deg" in orbit:
+            print(f"the training cameras stood on one side: the path sways within their {orbit['arc_deg']:.0f} degrees")
+        cameras = orbit_cameras(options.orbit or 1, orbit, options.size)
     prepare_outputs(folder=str(out.parent if is_video else out))
     film = Film(target.model, cameras, target.background, options.aov, options.early_stop_eps, options.lod)
     started = time.perf_counter()

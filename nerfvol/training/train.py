@@ -10,6 +10,7 @@ A checkpoint holds all that lives between two steps. It is written after the fir
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import time
@@ -22,6 +23,7 @@ from tqdm import tqdm
 from nerfvol import __version__
 from nerfvol.config.training import FINEST_LEVEL, Config
 from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
 from nerfvol.files.checkpoint import save_checkpoint
@@ -83,7 +85,12 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
             f"with --config {out / run_folder.CONFIG}")  # fmt: skip
         return None
     clock = Clock(started, saved["elapsed"] if saved else 0.0)
-    data = load_data(config, say)
+    try:
+        data = load_data(config, say)
+    except InputError:
+        with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays
+            out.rmdir()
+        raise
     run = Run(config, data, clock, saved, say)
     with run.interruptible(), run:
         phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
