@@ -11,7 +11,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.splats.points import PointCloud
-from nerfvol.starts.model_points import model_points, points_file
+from nerfvol.starts.model_points import has_points, model_points
 from nerfvol.starts.plane_sweep import SweepView, plane_sweep, sweep_factor
 from nerfvol.starts.random import random_points
 from nerfvol.starts.subject import Subject, subject_of
@@ -58,7 +58,7 @@ def _suited(dataset: Dataset) -> tuple[str, str]:
     """The row that suits a dataset and why."""
     if dataset.scene.has_alpha:
         return "random", "an object on a transparent background is seen whole"
-    if points_file(dataset) is None:
+    if not has_points(dataset):
         return "sweep", "photographs with poses alone"
     n = len(model_points(dataset)[0])
     if n < FEW_POINTS:
