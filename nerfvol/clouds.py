@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.cameras.through_lens import through_lens
-from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
+from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
-from nerfvol.kernels.checks import check_background, check_early_stop
-from nerfvol.kernels.splat_state import view_of
-from nerfvol.kernels.state import OUTPUTS
+from nerfvol.kernels.splat_ops import render_points, render_splats
 from nerfvol.octree.io import storage_of
 from nerfvol.splats.io import save_splats
 from nerfvol.splats.ply import is_splat_ply
@@ -64,20 +61,8 @@ class PointModel:
         lod: float = DEFAULT_LOD,
     ) -> dict[str, Float]:
         """See models.Model; through any lens. ``lod`` changes nothing."""
-        if self.composite == "over":
-            return self._model.render(camera, background, outputs, early_stop_eps, lod)
-        from nerfvol.kernels.point_surfaces import render_surfaces
-
-        colour = check_background(self.metadata.get("background", WHITE) if background is None else background)
-        eps, splats = check_early_stop(early_stop_eps), self.splats
-        if unknown := set(outputs) - set(OUTPUTS):
-            raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
-
-        def pinhole(seen: Camera) -> dict[str, Float]:
-            drawn = render_surfaces(splats, view_of(seen, splats.origin, self.near), colour, eps)
-            return {name: drawn[name] for name in outputs}
-
-        return through_lens(pinhole, camera)
+        operator = render_points if self.composite == "surface" else render_splats
+        return self._model.drawn_by(operator, camera, background, outputs, early_stop_eps)
 
     def aabb(self) -> NDArray[np.float64]:
         """(2, 3) corners of the box around the middle 98 % of the points, as for splats."""
