@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -24,23 +26,26 @@ if TYPE_CHECKING:
     from nerfvol.models import Model
 
 Float = NDArray[np.float32]
-Composite = Literal["over", "surface"]
+Composite = Literal["surface", "over"]
+_SCALES: dict[Composite, float] = {"surface": 0.5, "over": 0.6}
+"""A point's deviation in distances to its neighbours. Laid over each other, Gaussians of 0.5 let 6 % of what is behind a screen
+through and ripple by 1 %, those of 0.6 1.5 % and 0.4 %; averaged, the narrower ones are sharper and close a surface as well."""
 
 
 class PointModel:
     """A point cloud as a model (models.Model), drawn by EWA splatting: a point is as wide as its neighbours are far.
 
-    ``composite``: "over": almost opaque Gaussians one over the other; "surface": those at one depth are averaged first
-    (kernels.point_surfaces), which no gap or overlap of points shows in.
+    ``composite``: "surface": points at one depth are averaged first (kernels.point_reference), which no gap or overlap of
+    points shows in; "over": almost opaque Gaussians one over the other, as viewers of splats draw them.
     """
 
     kind = "points"
 
     def __init__(
-        self, cloud: PointCloud, metadata: Mapping[str, Any] | None = None, composite: Composite = "over"
+        self, cloud: PointCloud, metadata: Mapping[str, Any] | None = None, composite: Composite = "surface"
     ) -> None:
         self.cloud, self.metadata, self.composite = cloud, dict(metadata or {}), composite
-        self._model = SplatModel(splats_of_points(cloud), metadata)
+        self._model = SplatModel(splats_of_points(cloud, _SCALES[composite]), metadata)
 
     @property
     def near(self) -> float:
@@ -49,8 +54,9 @@ class PointModel:
 
     @property
     def splats(self) -> Splats:
-        """What is drawn, a copy."""
-        return self._model.splats
+        """Gaussians that show the cloud in viewers of splats, a copy."""
+        splats = self._model.splats
+        return replace(splats, log_scales=splats.log_scales + math.log(_SCALES["over"] / _SCALES[self.composite]))
 
     def render(
         self,
@@ -73,7 +79,7 @@ class PointModel:
         return {
             "points": len(self.cloud),
             "normals": self.cloud.normals is not None,
-            "radius": float(f"{np.exp(np.median(self.splats.log_scales[:, 0])):.4g}"),
+            "radius": float(f"{np.exp(np.median(self._model.splats.log_scales[:, 0])):.4g}"),
             "aabb": self.aabb().tolist(),
             "bytes_in_memory": int(self._model.packed.params.nbytes + self.cloud.positions.nbytes),
         }
