@@ -47,6 +47,8 @@ class SplatConfig(Checked):
     """Weight of 1 - SSIM of 4x4 blocks next to the mean squared error. None: 0.03 in photographs, 0.02 for objects."""
     scale: Weight = 0.0
     """Weight of the mean of the scales over the subject's distance: fewer large flat Gaussians behind everything."""
+    most_ratio: Annotated[float, within(1.5, 1e6)] = 12.0
+    """A Gaussian's longest scale over its second, at most: needles fit a photograph and spoil the views between."""
     grow_every: Count = 60
     """Steps between two rounds of splitting and pruning."""
     prune_opacity: Share = 0.02

@@ -75,8 +75,12 @@ def adam_step(state: SplatState, g: np.ndarray, hit: np.ndarray, rates: SplatRat
     m, v = first + (1 - rates.beta1) * (g - first), second + (1 - rates.beta2) * (g * g - second)
     count = updates[:, None].clip(1)
     step = rate * m / (1 - rates.beta1**count) / (np.sqrt(v / (1 - rates.beta2**count)) + rates.eps)
+    new_value = value - step
+    if rates.most_log_ratio:
+        scales = new_value[:, packing.LOG_SCALES]
+        new_value[:, packing.LOG_SCALES] = np.minimum(scales, np.median(scales, 1, keepdims=True) + rates.most_log_ratio)
     fill = packing.padding(g.shape[1])
-    for blocks, old, new in ((state.params, value, value - step), (state.first, first, m), (state.second, second, v)):
+    for blocks, old, new in ((state.params, value, new_value), (state.first, first, m), (state.second, second, v)):
         rows = np.where(hit[:, None], new, old).astype(np.float32)
         blocks[...] = packing.to_blocks(rows, fill if blocks is state.params else np.zeros_like(fill))
 

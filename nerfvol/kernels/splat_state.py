@@ -92,7 +92,8 @@ class SplatOptions:
 class SplatRates:
     """Adam: value -= rate m / (1 - beta1^n) / (sqrt(v / (1 - beta2^n)) + eps), n the splat's own number of updates.
 
-    means: as a factor of the splat's own size, the geometric mean of its scales.
+    means: as a factor of the splat's own size, the geometric mean of its scales. most_log_ratio: after a step a splat's longest
+    scale is at most this above the second, as logarithms; 0: any.
     """
 
     means: float = 0.2
@@ -104,6 +105,7 @@ class SplatRates:
     beta1: float = 0.9
     beta2: float = 0.98
     eps: float = 1e-12
+    most_log_ratio: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """``.spz``: Gaussians quantised and compressed to about a fifth of a PLY, through the library gsply (an optional extra).
 
 Format: Niantic's spz, a header (magic, version, count, degree, bits, flags) and sections, gzip up to version 3, zstd in 4.
-Flag 1 says that footprints are "mip"; the library leaves it alone, so it is set and read here. The format means right, up,
-backwards by its axes while nothing in a scene says which way is up: values are written as they are, as in a PLY.
+Flag 1 says that footprints are "mip"; the library leaves it alone, so it is set and read here. The format's axes are right,
+up, backwards, where programs take those of a PLY for right, down, forwards: what converts between the two makes half a turn
+about x, and so does this module, so that the .ply and the .spz of one scene open alike.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import gzip
 import os
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO
@@ -63,6 +65,7 @@ def save_spz(path: str | os.PathLike[str], splats: Splats, version: int = 3) -> 
         splats.validate()
     except InputError as error:
         raise InputError(f"cannot write {path}: {error}") from error
+    splats = _half_a_turn(splats)
     means = splats.means.astype(np.float64) + splats.origin
     largest = float(np.abs(means).max(initial=0.0))
     bits = _POSITION_BITS if largest <= 1 else _POSITION_BITS - int(np.ceil(np.log2(largest * (1 + 1e-6))))
@@ -110,7 +113,18 @@ def load_spz(path: str | os.PathLike[str]) -> Splats:
         raise _fault(path, str(error)) from error
     except Exception as error:  # whatever a damaged file makes the library do is the file's fault
         raise _fault(path, _first_line(error)) from error
-    return splats
+    return _half_a_turn(splats)
+
+
+def _half_a_turn(splats: Splats) -> Splats:
+    """The splats turned by 180 degrees about the x axis: y and z change signs, and so do harmonics that are odd in both together."""
+    turn = np.array([1.0, -1.0, -1.0])
+    # Of y, z, x; xy, yz, zz, xz, xx - yy; y(..), xyz, y(..), z(..), x(..), z(..), x(..).
+    signs = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+    return replace(
+        splats, means=(splats.means * turn).astype(np.float32), origin=splats.origin * turn,
+        quats=splats.quats * np.float32([1, 1, -1, -1]), sh=splats.sh * signs[: splats.sh.shape[2]],
+    )  # fmt: skip
 
 
 def _checked_flags(path: Path) -> int:

@@ -155,6 +155,7 @@ class SplatTrainer:
         return SplatRates(
             means=c.rate_means * (c.rate_decay_means or 1.0) ** progress, log_scales=c.rate_scales * fade,
             quats=c.rate_quats * fade, logits=c.rate_logits * fade, dc=c.rate_dc * fade, sh=c.rate_sh * fade, beta2=c.beta2,
+            most_log_ratio=math.log(c.most_ratio),
         )  # fmt: skip
 
     def grow(self, progress: float) -> None:

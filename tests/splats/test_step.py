@@ -1,5 +1,7 @@
 """The training step: Adam, statistics, masks, edges, the path without compiled kernels."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -173,3 +175,22 @@ def test_what_is_refused(wrong):
         else:
             state.first = state.first[:-1]
             splat_ops.train_step(state, view, image, OPTIONS, RATES)
+
+
+def test_no_needles(isa):
+    """After a step what was hit has no longest scale beyond the bound, as Adam's twin has it; the rest stays as it was."""
+    rates = dataclasses.replace(RATES, log_scales=0.5, most_log_ratio=float(np.log(3.0)))
+    state, view = splat_ops.SplatState(random_splats(60, 4, 7)), view_of_cube(32, 16)
+    before = state.splats().log_scales
+    for k in range(3):
+        image, expected = random_image(view, k), copy_of(state)
+        gradient, _ = splat_ops.loss_gradient(state, view, image, OPTIONS)
+        hit = packing.from_blocks(gradient, state.n).any(1)
+        splat_on_torch.adam_step(expected, packing.from_blocks(gradient, state.n), hit, rates)
+        splat_ops.train_step(state, view, image, OPTIONS, rates)
+        assert np.abs(state.splats().log_scales - expected.splats().log_scales).max() < 1e-4
+    scales, touched = np.sort(state.splats().log_scales, axis=1), state.per_splat("updates") > 0
+    assert (scales[touched, 2] - scales[touched, 1]).max() <= np.log(3.0) + 1e-6
+    was = np.sort(before, axis=1)
+    assert ((was[:, 2] - was[:, 1])[touched] > np.log(3.0)).any() and 0 < touched.sum() < 60
+    assert np.array_equal(state.splats().log_scales[~touched], before[~touched])

@@ -137,7 +137,8 @@ void bind_splats(nb::module_& m) {
     nb::class_<SplatRates>(m, "SplatRates").def(nb::init<>())
         .def_rw("means", &SplatRates::means).def_rw("log_scales", &SplatRates::log_scales).def_rw("quats", &SplatRates::quats)
         .def_rw("logits", &SplatRates::logits).def_rw("dc", &SplatRates::dc).def_rw("sh", &SplatRates::sh)
-        .def_rw("beta1", &SplatRates::beta1).def_rw("beta2", &SplatRates::beta2).def_rw("eps", &SplatRates::eps);
+        .def_rw("beta1", &SplatRates::beta1).def_rw("beta2", &SplatRates::beta2).def_rw("eps", &SplatRates::eps)
+        .def_rw("most_log_ratio", &SplatRates::most_log_ratio);
     nb::class_<SplatReport>(m, "SplatReport")
         .def_ro("loss", &SplatReport::loss).def_ro("squared_error", &SplatReport::squared_error).def_ro("pixels", &SplatReport::pixels)
         .def_ro("visible", &SplatReport::visible).def_ro("entries", &SplatReport::entries).def_ro("blocks", &SplatReport::blocks);

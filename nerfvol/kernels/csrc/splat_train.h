@@ -85,6 +85,16 @@ struct Adam {
     }
 };
 
+// No needles: a longest scale is at most `most` above the second, as logarithms. Where a Gaussian was not hit it stays.
+inline void blunt(float* scales, const f16& hit, float most) {
+    const f16 a = load<f16>(scales), b = load<f16>(scales + 16), c = load<f16>(scales + 32);
+    const f16 limit = vmax(vmin(a, b), vmin(vmax(a, b), c)) + most;  // the second is the middle one
+    for (int k = 0; k < 3; ++k) {
+        const f16 s = load<f16>(scales + 16 * k);
+        store(scales + 16 * k, select_less(hit, 0.5f, s, vmin(s, limit)));
+    }
+}
+
 template <int K> void update_block(const StepSetting& set, int64_t block, const f16& hit, const f16* gradient) {
     constexpr int kRows = nerfvol::kSh + 3 * K;
     const SplatMemory& m = set.memory;
@@ -99,6 +109,7 @@ template <int K> void update_block(const StepSetting& set, int64_t block, const 
         const int64_t i = at + 16 * row;
         adam.apply(gradient[row], row < nerfvol::kLogScale ? size * rate : splat16(rate), m.params + i, m.first + i, m.second + i);
     }
+    if (r.most_log_ratio > 0) blunt(m.params + at + 16 * nerfvol::kLogScale, hit, r.most_log_ratio);
 }
 
 template <int K> void finish_block(const StepSetting& set, const Frame& f, const StepLines& lines, int64_t block) {

@@ -48,6 +48,7 @@ struct SplatLoss {
 struct SplatRates {
     float means = 0, log_scales = 0, quats = 0, logits = 0, dc = 0, sh = 0;
     float beta1 = 0.9f, beta2 = 0.98f, eps = 1e-12f;
+    float most_log_ratio = 0;                   // of the longest scale to the second; 0: any
 };
 
 struct SplatImage {                 // RGBA, rows and columns padded to multiples of 16; alpha is the pixel's weight
