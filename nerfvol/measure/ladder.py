@@ -94,8 +94,8 @@ def ladder_figure(record: Mapping[str, Any]) -> Any:
     """PSNR with the published figures, and SSIM, against minutes."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.4), layout="constrained")
-    axes = figure.subplots(1, 2)
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    axes = figure.subplots(1, 2, sharex=True)
     for number, name in enumerate(dict.fromkeys(row["representation"] for row in record["rows"])):
         rows = sorted((r for r in record["rows"] if r["representation"] == name), key=lambda r: r["seconds"])
         minutes = [row["seconds"] / 60 for row in rows]
@@ -110,8 +110,10 @@ def ladder_figure(record: Mapping[str, Any]) -> Any:
             axes[0].axhline(psnr, ls=":", lw=1, color=colour, label=name)
     for place, unit in zip(axes, ("PSNR / dB", "SSIM"), strict=True):
         place.set(xscale="log", xlabel="minutes, loading and scoring included", ylabel=unit)
+        place.xaxis.set_major_formatter("{x:g}")
+        place.xaxis.set_minor_formatter("")
         place.grid(True, which="both", alpha=0.25)
-        place.legend(fontsize=7)
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
     figure.suptitle(f"{record['data']}: {record['hardware']['cpu']}, {record['threads']} threads", fontsize=10)
     return figure
 
