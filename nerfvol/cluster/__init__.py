@@ -1,1 +1,1 @@
-"""Work shared by several machines through Dask ``distributed`` (the extra ``nerfvol[cluster]``), imported only when asked for."""
+"""Work shared by several machines through Dask ``distributed``: the extra ``nerfvol[cluster]``, imported when asked for."""

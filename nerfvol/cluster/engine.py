@@ -12,7 +12,7 @@ import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nerfvol.errors import InputError
 from nerfvol.machine import usable_cores
@@ -40,16 +40,16 @@ def connect(where: str) -> Iterator[Client]:
         InputError: ``distributed`` is not installed, nothing answers there, or ``where`` is none of the three.
     """
     try:
-        import dask
         import distributed
+        from dask import config
     except ImportError as error:
         raise InputError("--cluster needs the package distributed: pip install 'nerfvol[cluster]'") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what goes wrong is said by us, once
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(SETTINGS))  # pyright: ignore[reportArgumentType]
+        stack.enter_context(config.set(SETTINGS))
         local = re.fullmatch(r"local:(\d+)", where)
         if local:
-            target = {"address": stack.enter_context(_own_cluster(int(local[1])))}
+            target: dict[str, Any] = {"address": stack.enter_context(_own_cluster(int(local[1])))}
         elif "://" in where:
             target = {"address": where}
         elif Path(where).is_file():

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from distributed import WorkerPlugin
 
@@ -134,7 +134,7 @@ def welcome(client: Client, needs: Needs, patience: float = PATIENCE) -> tuple[s
 
 def _refused(client: Client, resource: str, workers: dict[str, Any]) -> dict[str, str]:
     found = {}
-    for _, event in client.get_events(TOPIC):
+    for _, event in cast("tuple[tuple[float, Any], ...]", client.get_events(TOPIC)):
         if isinstance(event, dict) and event.get("resource") == resource and event.get("worker") in workers:
             found[event["worker"]] = str(event.get("reason"))
     return found

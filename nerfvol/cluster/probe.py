@@ -28,17 +28,21 @@ def pictures() -> bytes:
     return digest.digest()
 
 
-def _numbers(*shape: int) -> NDArray[np.float64]:
+def _numbers(*shape: int) -> NDArray[np.float32]:
     """Values in [-1, 1) by whole-number arithmetic (Knuth's multiplicative hash): sines differ between processors."""
     count = int(np.prod(shape))
-    return ((np.arange(1, count + 1, dtype=np.uint64) * 2654435761 % 2**32) / 2.0**31 - 1.0).reshape(shape)
+    return (
+        ((np.arange(1, count + 1, dtype=np.uint64) * 2654435761 % 2**32) / 2.0**31 - 1.0)
+        .reshape(shape)
+        .astype(np.float32)
+    )
 
 
 def _octree(degree: int) -> Octree:
     """8^3 leaves, half of them nearly empty."""
     cells = np.indices((8, 8, 8)).reshape(3, -1).T
     octree = Octree.from_leaves(np.full(len(cells), 3), cells, (-0.5, -0.5, -0.5), 1.0, degree)
-    octree.density = 6.0 * _numbers(octree.n_vertices)
+    octree.density = 6 * _numbers(octree.n_vertices)
     octree.sh = 0.4 * _numbers(*octree.sh.shape)
     return octree
 

@@ -7,12 +7,12 @@ import contextlib
 import statistics
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Coroutine, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED
 from concurrent.futures import Future as Fetch
 from concurrent.futures import wait as wait_for
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from nerfvol.cluster import ship
 from nerfvol.cluster.fit import Needs, fit_workers, welcome
@@ -113,8 +113,9 @@ class Window:
         except Exception as error:
             raise self._gone() from error
         # Each result is fetched for itself: one that lies on a frozen worker does not hold up the others.
-        loop = self.client.loop.asyncio_loop  # pyright: ignore[reportAttributeAccessIssue]
-        fetch = asyncio.run_coroutine_threadsafe(self.client.gather([future], asynchronous=True), loop)
+        loop = cast(Any, self.client.loop).asyncio_loop
+        gathering = cast(Coroutine[Any, Any, Any], self.client.gather([future], asynchronous=True))
+        fetch = asyncio.run_coroutine_threadsafe(gathering, loop)
         self._tasks[fetch] = _Task(first, last, future, time.monotonic(), attempts)
 
     def _finished(self, items: Sequence[Any]) -> Iterator[tuple[int, Done]]:
@@ -180,8 +181,9 @@ class Window:
         """Who runs a task or holds its result."""
         try:
             if future.status == "finished":
-                return list(self.client.who_has([future])[future.key])
-            return [address for address, keys in self.client.processing().items() if future.key in keys]
+                return list(cast(dict[str, Any], self.client.who_has([future]))[str(future.key)])
+            processing = cast(dict[str, Any], self.client.processing())
+            return [address for address, keys in processing.items() if future.key in keys]
         except (OSError, KeyError, ValueError):
             return []
 
