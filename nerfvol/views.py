@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -214,11 +214,22 @@ class SplatModel:
         lod: float = DEFAULT_LOD,
     ) -> dict[str, Float]:
         """See models.Model; through any lens. ``lod`` changes nothing: splats have no levels."""
+        return self.drawn_by(render_splats, camera, background, outputs, early_stop_eps)
+
+    def drawn_by(
+        self,
+        operator: Callable[..., dict[str, Float]],
+        camera: Camera,
+        background: Sequence[float] | None,
+        outputs: Sequence[str],
+        early_stop_eps: float,
+    ) -> dict[str, Float]:
+        """As :meth:`render`, by render_splats or render_points of splat_ops."""
         colour = self.metadata.get("background", WHITE) if background is None else background
 
         def pinhole(seen: Camera) -> dict[str, Float]:
             view = view_of(seen, self.packed.origin, max(self.near, self._nearest(seen)))
-            return render_splats(self.packed, view, colour, early_stop_eps, outputs)
+            return operator(self.packed, view, colour, early_stop_eps, outputs)
 
         return through_lens(pinhole, camera)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import statistics
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ class EvalOptions:
     target: str = ""
     data: str | None = None
     split: Literal["train", "val", "test"] = "val"
+    holdout: Literal["own", "arc"] | None = None
     downscale: Count = 1
     background: Colour | None = None
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
@@ -34,6 +36,7 @@ class EvalOptions:
     json: str | None = None
     save_images: str | None = None
     truth: str | None = None
+    lpips: bool = False
     threads: int = 0
 
 
@@ -42,9 +45,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
     add_target(p)
     p.add_argument("--data", metavar="DIR", help="posed images to compare with (default: those of the run)")
     p.add_argument("--split", metavar="train|val|test", help="which views (default: val)")
+    p.add_argument("--holdout", metavar="own|arc", help="how views were held out (default: as the run did, else own)")
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
     p.add_argument("--json", metavar="FILE", help="write scores, per-image rows, seconds per frame and hardware")
     p.add_argument("--save-images", metavar="DIR", help="write truth | render | error | depth for every view")
+    p.add_argument("--lpips", action="store_true", help="also score LPIPS (VGG); needs nerfvol[lpips] and some seconds a view")
     p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
                    "(with --save-images: slices of both)")  # fmt: skip
     add_drawing(p)
@@ -60,6 +65,7 @@ def run(options: EvalOptions) -> int:
     set_threads(options.threads)
     from nerfvol.datasets.load import load_dataset
     from nerfvol.files.atomic import write_json
+    from nerfvol.measure.perceptual import NETWORK, load_lpips
     from nerfvol.measure.scores import comparison_writer, evaluate
 
     prepare_outputs(options.save_images, options.json)
@@ -67,15 +73,29 @@ def run(options: EvalOptions) -> int:
     data = options.data or run_settings(options.target).get("data")
     if not data:
         raise InputError(f"nerfvol eval needs --data DIR: {options.target} has no config.yaml that says what it saw")
-    dataset = load_dataset(data, options.split, options.downscale)
+    holdout = options.holdout or ("own" if options.data else run_settings(options.target).get("holdout", "own"))
+    dataset = load_dataset(data, options.split, options.downscale, holdout=holdout)
     for message in dataset.messages:
         print(message, file=sys.stderr)
     drawing = target.background, options.early_stop_eps, options.lod
-    on_view = None
+    seers = []
     if options.save_images is not None:
-        on_view = comparison_writer(Path(options.save_images), target.model, dataset, *drawing)
-    scores = evaluate(target.model, dataset, *drawing, on_view)
-    record = _record(options, scores, target, str(data), dataset)
+        seers.append(comparison_writer(Path(options.save_images), target.model, dataset, *drawing))
+    distances: dict[int, float] = {}
+    if options.lpips:
+        distance = load_lpips()
+        seers.append(lambda i, truth, image: distances.__setitem__(i, distance(image, truth)))
+
+    def on_view(index: int, truth: Any, image: Any) -> None:
+        for see in seers:
+            see(index, truth, image)
+
+    scores = evaluate(target.model, dataset, *drawing, on_view if seers else None)
+    for index, value in distances.items():
+        scores["rows"][index]["lpips"] = value
+    record = _record(options, scores, target, str(data), dataset) | {"holdout": holdout}
+    if distances:
+        record |= {"lpips": statistics.fmean(distances.values()), "lpips_network": NETWORK}
     _print_scores(record, options.split)
     if options.truth is not None:
         record["truth"] = _compare_with_truth(target, options.truth, options.save_images)
@@ -140,12 +160,14 @@ def _record(
 def _print_scores(record: dict[str, Any], split: str) -> None:
     width = max(len(row["name"]) for row in record["rows"])
     for row in record["rows"]:
-        print(f"{row['name']:{width}s}  {row['psnr']:6.2f} dB  ssim {row['ssim']:.4f}  {row['seconds']:.3f} s")
+        distance = f"  lpips {row['lpips']:.4f}" if "lpips" in row else ""
+        print(f"{row['name']:{width}s}  {row['psnr']:6.2f} dB  ssim {row['ssim']:.4f}{distance}  {row['seconds']:.3f} s")
     size = "x".join(map(str, record["image_size"]))
     background = ",".join(f"{component:g}" for component in record["background"])
+    distance = f", LPIPS {record['lpips']:.4f} ({record['lpips_network']})" if "lpips" in record else ""
     print(
         f"{record['n_images']} {split} views at {size} on background {background}: "
-        f"PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}, {record['seconds_per_frame']:.3f} s per frame "
+        f"PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}{distance}, {record['seconds_per_frame']:.3f} s per frame "
         f"({record['threads']} threads, {record['kernel_path']})"
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,7 +30,7 @@ class RenderOptions:
     background: Colour | None = None
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
     lod: Annotated[float, pixels] = DEFAULT_LOD
-    composite: Literal["over", "surface"] | None = None
+    composite: Literal["surface", "over"] | None = None
     threads: int = 0
 
 
@@ -44,9 +44,9 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--aov", metavar="LIST", help="also write depth,median_depth,opacity,normal")
     p.add_argument("--format", metavar="png|exr", help="exr: linear float, all AOVs in one file (default: png)")
     p.add_argument("--fps", metavar="N", help="frames a second of a video (default: 30)")
-    p.add_argument("--composite", metavar="over|surface", help="point clouds (.ply without scales): over: one almost opaque "
-                   "disc or ball over the other; surface: points at one depth are averaged first, so that neither gaps "
-                   "nor overlaps show; in numpy, many times slower (default: over)")  # fmt: skip
+    p.add_argument("--composite", metavar="surface|over", help="point clouds (.ply without scales): surface: points at one "
+                   "depth are averaged first, so that neither gaps nor overlaps show; over: one almost opaque disc or ball "
+                   "over the other, as viewers of splats draw them (default: surface)")  # fmt: skip
     add_drawing(p)
 
 
@@ -69,7 +69,7 @@ def run(options: RenderOptions) -> int:
 
     target = open_target(options.target, options.background)
     if options.composite is not None:
-        _composite(target, options.composite)
+        target = _composited(target, options.composite)
     if options.cameras is not None:
         cameras = load_cameras(options.cameras, options.size)
     else:
@@ -87,12 +87,16 @@ def run(options: RenderOptions) -> int:
     return 0
 
 
-def _composite(target: Target, composite: Literal["over", "surface"]) -> None:
+def _composited(target: Target, composite: Literal["surface", "over"]) -> Target:
+    """The point cloud drawn in that way; InputError for any other model."""
     from nerfvol.clouds import PointModel
 
-    if not isinstance(target.model, PointModel):
-        raise InputError(f"--composite is for point clouds, {target.path} is a model of {target.model.kind}")
-    target.model.composite = composite
+    model = target.model
+    if not isinstance(model, PointModel):
+        raise InputError(f"--composite is for point clouds, {target.path} is a model of {model.kind}")
+    if composite == model.composite:
+        return target
+    return replace(target, model=PointModel(model.cloud, model.metadata, composite))
 
 
 COMMAND = Command(

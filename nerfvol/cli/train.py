@@ -34,6 +34,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
     p.add_argument("--aabb", metavar="X0,Y0,Z0,X1,Y1,Z1", help="the region of detail in the units of the poses: lowest "
                    "and highest corner (default: worked out from the cameras)")  # fmt: skip
+    p.add_argument("--holdout", metavar="own|arc", help="views that are scored, not trained on. own: the data's, or every 8th; "
+                   "arc: an eighth of the training views, next to each other, which asks for more (default: own)")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")

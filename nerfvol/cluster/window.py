@@ -42,10 +42,13 @@ class _Task:
 
 
 class Window:
-    """Runs a job on a client's workers. ``messages``: sentences on workers that take no part."""
+    """Runs a job on a client's workers. ``messages``: sentences on workers that take no part.
 
-    def __init__(self, client: Client, job: Job, needs: Needs) -> None:
-        self.client, self.job = client, job
+    repeat_late: items that take five times as long as others are given out once more; not where two may not write one folder.
+    """
+
+    def __init__(self, client: Client, job: Job, needs: Needs, repeat_late: bool = True) -> None:
+        self.client, self.job, self.repeat_late = client, job, repeat_late
         self.resource, self.messages = welcome(client, needs)
         self._id = uuid.uuid4().hex[:8]
         self._times: list[float] = []
@@ -168,7 +171,7 @@ class Window:
         """The oldest items that are missing are given out once more after five times what they take: who has them is frozen,
         perhaps. The same bits come from anyone, and the first to come counts."""
         tries = [task for task in self._tasks.values() if task.first == oldest]
-        if not tries or not self._times:
+        if not tries or not self._times or not self.repeat_late:
             return
         task = tries[-1]
         usual = statistics.median(self._times) * (task.last - task.first)

@@ -327,6 +327,9 @@ class Config(Checked):
     """Images are area-averaged by this whole factor."""
     aabb: Annotated[tuple[float, float, float, float, float, float] | None, box] = None
     """The region of detail, lowest and highest corner in the units of the poses; None: worked out from the cameras."""
+    holdout: Literal["own", "arc"] = "own"
+    """Views that are scored and not trained on. own: the data's, or every 8th; arc: neighbours among the training views, which
+    says more of views between and beside the photographs."""
     threads: Annotated[int, at_least(0)] = 0
     """CPU threads; 0: all cores this process may use."""
     seed: int = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.bounds import bounds_of_box, estimate_bounds, require_seen
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.formats import SPLITS, find_format
+from nerfvol.datasets.holdout import HOLDOUTS, hold_out_arc
 from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
 from nerfvol.datasets.listing import Frame, Listing, listed_names
 from nerfvol.datasets.store import ImageStore
@@ -27,6 +29,7 @@ def load_dataset(
     downscale: int = 1,
     aabb: ArrayLike | None = None,
     threads: int | None = None,
+    holdout: str = "own",
 ) -> Dataset:
     """Loads one split of a folder of posed images, whatever its format (docs/data.md).
 
@@ -37,6 +40,8 @@ def load_dataset(
         aabb: the region of detail (see SceneBounds) instead of the one worked out: x0, y0, z0, x1, y1, z1 or its two
             corners (2, 3), in scene units.
         threads: threads that decode; one for every core by default.
+        holdout: "own": the split is the files', or every 8th view is held out; "arc": neighbours among the views that would
+            then train are held out together, for validation and test alike, and the others train.
 
     Raises:
         InputError: where the files cannot be used, in one sentence that names the file.
@@ -46,7 +51,10 @@ def load_dataset(
     if not isinstance(downscale, int) or not 1 <= downscale <= 256:
         raise InputError(f"downscale must be an integer between 1 and 256, got {downscale!r}")
     box = None if aabb is None else check_box(aabb, "aabb")
-    listing = find_format(Path(path)).reader.read(Path(path), split)
+    if holdout not in HOLDOUTS:
+        raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
+    reader = find_format(Path(path)).reader
+    listing = reader.read(Path(path), split) if holdout == "own" else _without_arc(reader.read(Path(path), "train"), split)
     messages = list(listing.messages)
     frames = _present(listing, messages)
     sizes = map_threads(lambda frame: image_size(frame.file), frames, threads)
@@ -70,6 +78,17 @@ def load_dataset(
     store = ImageStore(len(images), lambda: decode()[0], images)
     names, source = listed_names(frames), str(listing.source)
     return Dataset(cameras, store, names, scene, source, messages, threads, listing.read_points)
+
+
+def _without_arc(listing: Listing, split: str) -> Listing:
+    """The listing of the training split as one of the arc, or of what is left of it."""
+    present = [frame for frame in listing.frames if frame.path is not None]
+    try:
+        kept, held, sentence = hold_out_arc(present)
+    except InputError as error:
+        raise InputError(f"{listing.source}: {error}") from error
+    frames = kept if split == "train" else held
+    return replace(listing, frames=frames, training=kept, messages=[*listing.messages, sentence])
 
 
 def _present(listing: Listing, messages: list[str]) -> list[Frame]:

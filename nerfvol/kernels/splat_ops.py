@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.defaults import WHITE
-from nerfvol.kernels.checks import check_background, check_early_stop
+from nerfvol.kernels.checks import check_background, check_early_stop, check_outputs
 from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatReport, SplatState, SplatView, view_of
 from nerfvol.kernels.state import OUTPUTS
 from nerfvol.native import aligned_empty, native
-from nerfvol.splats.packing import PackedSplats, as_packed
+from nerfvol.splats.packing import PackedSplats, as_packed, unpack
 from nerfvol.splats.splats import Splats
 
 __all__ = [
     "OUTPUTS", "SplatOptions", "SplatRates", "SplatReport", "SplatState", "SplatView", "loss_gradient", "pad_image",
-    "render_splats", "train_step", "view_of",
+    "render_points", "render_splats", "train_step", "view_of",
 ]  # fmt: skip
 
 TILE = 16
@@ -58,17 +58,53 @@ def render_splats(
     to the plane through the mean that faces the camera. A pixel ends when T < early_stop_eps; 0 is exact. Raises ValueError
     where background, threshold or outputs are not what they should be.
     """
-    bg, eps = check_background(background), check_early_stop(early_stop_eps)
-    if unknown := set(outputs) - set(OUTPUTS):
-        raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
-    if (compiled := native()) is None:
+    bg, eps = _checked(background, early_stop_eps, outputs)
+    if native() is None:
         return _on_torch().render_splats(splats, view, bg, eps, outputs)
+    return _draw(as_packed(splats), view, bg, eps, outputs, surfaces=False)
+
+
+def render_points(
+    splats: Splats | PackedSplats,
+    view: SplatView,
+    background: Sequence[float] = WHITE,
+    early_stop_eps: float = 1e-4,
+    outputs: Sequence[str] = ("rgb",),
+) -> dict[str, NDArray[np.float32]]:
+    """As :func:`render_splats`, of splats of degree 0 that are points of surfaces: what is at one depth is averaged.
+
+    What is computed: ``point_reference``. The same bits for any number of threads. Raises ValueError as render_splats, and
+    where the splats have more than one colour.
+    """
+    bg, eps = _checked(background, early_stop_eps, outputs)
     packed = as_packed(splats)
+    if packed.basis != 1:
+        raise ValueError(f"points have one colour each, got spherical harmonics of degree {packed.sh_degree}")
+    if native() is None:
+        from nerfvol.kernels.point_reference import render_surfaces
+
+        drawn = render_surfaces(unpack(packed), view, bg, eps)
+        return {name: drawn[name] for name in OUTPUTS if name in outputs}
+    return _draw(packed, view, bg, eps, outputs, surfaces=True)
+
+
+def _checked(
+    background: Sequence[float], early_stop_eps: float, outputs: Sequence[str]
+) -> tuple[list[float], float]:
+    """Background and threshold as the kernels take them; ValueError where they or the outputs' names are wrong."""
+    check_outputs(outputs)
+    return check_background(background), check_early_stop(early_stop_eps)
+
+
+def _draw(
+    packed: PackedSplats, view: SplatView, bg: Sequence[float], eps: float, outputs: Sequence[str], surfaces: bool
+) -> dict[str, NDArray[np.float32]]:
+    compiled = native()
+    assert compiled is not None
     shape = (view.height, view.width)
     out = {k: np.empty((*shape, 3) if k in ("rgb", "normal") else shape, np.float32) for k in OUTPUTS if k in outputs}
-    compiled.splat_render(
-        packed.params, packed.n, packed.mode == "mip", _kernel_view(view), bg, eps, *(out.get(name) for name in OUTPUTS)
-    )
+    arrays = (out.get(name) for name in OUTPUTS)
+    compiled.splat_render(packed.params, packed.n, packed.mode == "mip", _kernel_view(view), bg, eps, *arrays, surfaces)
     return out
 
 

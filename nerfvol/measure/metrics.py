@@ -1,7 +1,7 @@
 """Image quality as the field reports it: PSNR and SSIM of RGB images in [0, 1], composited on a stated background.
 
 A score of several images is the mean of the per-image scores (not the PSNR of the mean squared error). LPIPS needs
-network weights that are not shipped, so it is not here. Images are numpy arrays or torch tensors of any float type.
+a network's weights: perceptual.py. Images are numpy arrays or torch tensors of any float type.
 """
 
 from __future__ import annotations

@@ -13,19 +13,24 @@ import struct
 import zlib
 from pathlib import Path
 from types import ModuleType
+from typing import BinaryIO
 
 import numpy as np
 
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write, explain_os_error
-from nerfvol.splats.splats import Splats
+from nerfvol.machine import total_memory
+from nerfvol.splats.splats import MAX_DEGREE, Splats
 
 VERSIONS = (3, 4)
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, reserved
 _MAGIC = b"NGSP"
 _FLAGS_AT = 14
 _MIP = 1
+_HEADER_4 = struct.Struct("<4sIIBBBBI")  # the same, then the number of streams and where their table begins; unpacked
 _SMALLEST_ROW = 19  # bytes of a Gaussian of degree 0 once unpacked, version 2
+_EXTENSIONS = 1 << 20  # bytes that may follow the Gaussians
+_RUN = 1 << 20  # bytes that are unpacked at a time
 _LARGEST_RATIO = 1032  # of deflate
 _POSITION_BITS = 23  # besides the sign
 _SHORTEST = 1e-12
@@ -109,28 +114,91 @@ def load_spz(path: str | os.PathLike[str]) -> Splats:
 
 
 def _checked_flags(path: Path) -> int:
-    """The header's flags; refuses what is no such file, and a count that the file cannot hold."""
+    """The header's flags; refuses what is no such file, and what the library would spend memory on in vain."""
     try:
         with path.open("rb") as file:
-            start = file.read(1 << 16)
-        size = path.stat().st_size
+            start = file.read(_HEADER_4.size)
+            size = os.fstat(file.fileno()).st_size
+            packed = start[:2] == b"\x1f\x8b"
+            if packed:
+                start = zlib.decompressobj(31).decompress(start + file.read(1 << 16), _HEADER.size)
+            if len(start) < _HEADER.size:
+                raise _fault(path, "it has no header")
+            magic, version, count, degree, _, flags, _ = _HEADER.unpack_from(start)
+            if magic != _MAGIC or version < 1:
+                raise _fault(path, f"it does not start like an .spz file of version 1 to {max(VERSIONS)}")
+            if version > max(VERSIONS):
+                raise _fault(path, f"it is of version {version}, versions 1 to {max(VERSIONS)} are known")
+            if degree > MAX_DEGREE:
+                raise _fault(path, f"its harmonics are of degree {degree}, expected 0 to {MAX_DEGREE}")
+            if count * _SMALLEST_ROW > _LARGEST_RATIO * size:
+                raise _fault(path, f"it declares {count} Gaussians, which its {size} bytes cannot hold")
+            _require_memory(path, count, degree)
+            row = _SMALLEST_ROW + (version >= 3) + 3 * ((degree + 1) ** 2 - 1)
+            if packed:
+                _check_gzip(path, file, _HEADER.size + count * row)
+            else:
+                _check_streams(path, file, size)
     except FileNotFoundError as error:
         raise InputError(f"no such .spz file: {path}") from error
     except OSError as error:
         raise InputError(f"cannot read {path}: {explain_os_error(error)}") from error
-    if start[:2] == b"\x1f\x8b":
-        try:
-            start = zlib.decompressobj(31).decompress(start, _HEADER.size)
-        except zlib.error as error:
-            raise _fault(path, _first_line(error)) from error
-    if len(start) < _HEADER.size:
-        raise _fault(path, "it has no header")
-    magic, version, count, _, _, flags, _ = _HEADER.unpack_from(start)
-    if magic != _MAGIC or not 1 <= version <= max(VERSIONS):
-        raise _fault(path, "it does not start like an .spz file of version 1 to 4")
-    if count * _SMALLEST_ROW > _LARGEST_RATIO * size:
-        raise _fault(path, f"it declares {count} Gaussians, which its {size} bytes cannot hold")
+    except zlib.error as error:
+        raise _fault(path, _first_line(error)) from error
     return flags
+
+
+def _require_memory(path: Path, count: int, degree: int) -> None:
+    """Refuses Gaussians that do not fit: the library's arrays, ours and a copy of them."""
+    need, have = 3 * 4 * count * (11 + 3 * (degree + 1) ** 2), total_memory()
+    if have is not None and need > 0.8 * have:
+        raise _fault(path, f"its {count} Gaussians need {need / 2**30:.1f} GiB, and there are {have / 2**30:.1f} GiB of memory")
+
+
+def _check_gzip(path: Path, file: BinaryIO, wanted: int) -> None:
+    """Refuses what unpacks to less than ``wanted`` bytes, or to so much more that it is no extension of the format."""
+    file.seek(0)
+    stream, found = zlib.decompressobj(31), 0
+    while found <= wanted + _EXTENSIONS:
+        data = stream.unused_data if stream.eof else stream.unconsumed_tail
+        if not (data := data or file.read(_RUN)):
+            break
+        if stream.eof:  # gzip's members may follow each other
+            stream = zlib.decompressobj(31)
+        found += len(stream.decompress(data, _RUN))
+    if found < wanted:
+        raise _fault(path, f"it should unpack to {wanted} bytes, and ends after {found}")
+    if found > wanted + _EXTENSIONS:
+        raise _fault(path, f"it should unpack to {wanted} bytes, and goes on for {_EXTENSIONS} more")
+
+
+def _check_streams(path: Path, file: BinaryIO, size: int) -> None:
+    """Refuses streams of version 4 that say of themselves that they unpack to more than the table of contents does."""
+    try:
+        from zstandard import ZstdError, frame_content_size  # the library needs it for these files
+    except ImportError as error:
+        raise InputError(f"{path} is of version 4, which needs zstandard: pip install 'nerfvol[spz]'") from error
+    file.seek(0)
+    start = file.read(_HEADER_4.size)
+    if len(start) < _HEADER_4.size:
+        raise _fault(path, "it has no header")
+    *_, streams, table_at = _HEADER_4.unpack(start)
+    file.seek(table_at)
+    table = file.read(16 * streams)
+    if len(table) < 16 * streams:
+        raise _fault(path, "it ends within its table of contents")
+    at = table_at + 16 * streams
+    for packed, unpacked in struct.iter_unpack("<QQ", table):
+        if at + packed > size:
+            raise _fault(path, "it ends within its streams")
+        file.seek(at)
+        try:
+            stated = frame_content_size(file.read(18))  # the longest header of a frame
+        except ZstdError as error:
+            raise _fault(path, _first_line(error)) from error
+        if stated > unpacked:
+            raise _fault(path, f"a stream should unpack to {unpacked} bytes, it states {stated}")
+        at += packed
 
 
 def _with_flag(data: bytes) -> bytes:

@@ -122,14 +122,15 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
         InputError: the data cannot be used, or there is nothing in the images.
     """
     started = time.perf_counter()
-    held_out = load_dataset(config.data, "val", config.downscale, config.aabb).evenly(LARGEST_HELD_OUT)
+    held_out = load_dataset(config.data, "val", config.downscale, config.aabb, holdout=config.holdout)
+    held_out = held_out.evenly(LARGEST_HELD_OUT)
     first = held_out.evenly(1)
     compared = held_out.evenly(config.compare_views).middles(COMPARED_SIZE)
     reading = 0.0
     if held_out.nbytes > HELD_OUT_KEPT:  # else released until they are scored
         held_out.release()
         reading = time.perf_counter() - started
-    training = load_dataset(config.data, "train", config.downscale, config.aabb)
+    training = load_dataset(config.data, "train", config.downscale, config.aabb, holdout=config.holdout)
     for message in training.messages:
         say(message)
     require_something(training, config.background)

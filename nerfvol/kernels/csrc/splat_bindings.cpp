@@ -67,16 +67,17 @@ void init_view(SplatView* self, const std::vector<float>& rotation, const std::v
 }
 
 void py_render(Params params, int64_t n, bool mip, const SplatView& view, const std::vector<float>& background, float eps,
-               Vectors rgb, Picture opacity, Picture depth, Picture median, Vectors normal) {
+               Vectors rgb, Picture opacity, Picture depth, Picture median, Vectors normal, bool surfaces) {
     const Splats splats = make_splats(params, n, mip);
     const auto check = [&](const auto& a) {
         require(!a || (int64_t(a->shape(0)) == view.height && int64_t(a->shape(1)) == view.width), "an output does not have the picture's size");
     };
     check(rgb); check(opacity); check(depth); check(median); check(normal);
+    require(!surfaces || splats.basis == 1, "points have one colour");
     const SplatRenderOptions options{{background.at(0), background.at(1), background.at(2)}, eps};
     const SplatOutput out{pointer(rgb), pointer(opacity), pointer(depth), pointer(median), pointer(normal)};
     nb::gil_scoped_release release;
-    splat_kernels().render(splats, view, options, out);
+    (surfaces ? splat_kernels().points : splat_kernels().render)(splats, view, options, out);
 }
 
 // With `gradient` the gradient of the loss is written there, 0 where a Gaussian was not hit, and nothing else changes.
@@ -141,7 +142,7 @@ void bind_splats(nb::module_& m) {
         .def_ro("loss", &SplatReport::loss).def_ro("squared_error", &SplatReport::squared_error).def_ro("pixels", &SplatReport::pixels)
         .def_ro("visible", &SplatReport::visible).def_ro("entries", &SplatReport::entries).def_ro("blocks", &SplatReport::blocks);
     m.def("splat_render", &py_render, "params"_a, "n"_a, "mip"_a, "view"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(),
-          "opacity"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none());
+          "opacity"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none(), "surfaces"_a = false);
     m.def("splat_step", &py_step, "params"_a, "n"_a, "mip"_a, "first"_a, "second"_a, "updates"_a, "error"_a, "max_weight"_a,
           "seen"_a, "view"_a, "image"_a, "loss"_a, "rates"_a, "gradient"_a.none());
     m.def("splat_gather", &py_gather, "blocks"_a, "index"_a, "padding"_a, "out"_a);

@@ -65,20 +65,19 @@ inline uint64_t depth_key(float z, float near) {
     return uint64_t(std::min((bits - from) >> 5, (1 << kDepthBits) - 1));
 }
 
-template <int K> void project_all(const Splats& splats, const SplatView& view, Frame& f, bool with_normals) {
+// Projects all blocks: project(block, its number, its records) returns the lanes that may be seen.
+template <class Project> void project_chunks(const Splats& splats, const SplatView& view, Frame& f, Project&& project) {
     const int64_t chunks = (splats.n_blocks + kChunk - 1) / kChunk, n = 16 * splats.n_blocks;
     Record* out = f.projected.need(size_t(n));
     uint64_t* keys = f.keys.need(size_t(n));
     Place* places = f.places.need(size_t(n));
-    float* normals = with_normals ? f.normals.need(size_t(4 * n)) : nullptr;
     f.chunk_counts.assign(size_t(chunks), 0);
     splat_for(chunks, [&](int chunk, int) {
         const int64_t first = int64_t(chunk) * kChunk, last = std::min(first + kChunk, splats.n_blocks);
         uint64_t* at = keys + 16 * first;
         for (int64_t b = first; b < last; ++b) {
-            const float* block = splats.params + b * splats.rows() * 16;
             std::memset(static_cast<void*>(places + 16 * b), 0, 16 * sizeof(Place));
-            uint32_t seen = project_block<K>(block, view, splats.mip, uint32_t(16 * b), out + 16 * b, normals ? normals + 64 * b : nullptr);
+            uint32_t seen = project(splats.params + b * splats.rows() * 16, b, out + 16 * b);
             for (; seen; seen &= seen - 1) {
                 const int64_t i = 16 * b + __builtin_ctz(seen);
                 *at++ = depth_key(out[i].z, view.near) << 32 | uint64_t(i);
@@ -88,6 +87,13 @@ template <int K> void project_all(const Splats& splats, const SplatView& view, F
     });
     f.visible = 0;
     for (int64_t c : f.chunk_counts) f.visible += c;
+}
+
+template <int K> void project_all(const Splats& splats, const SplatView& view, Frame& f, bool with_normals) {
+    float* normals = with_normals ? f.normals.need(size_t(64 * splats.n_blocks)) : nullptr;
+    project_chunks(splats, view, f, [&](const float* block, int64_t b, Record* out) {
+        return project_block<K>(block, view, splats.mip, uint32_t(16 * b), out, normals ? normals + 64 * b : nullptr);
+    });
 }
 
 // One stable pass over one digit: each(range, visit) calls visit(key) for a range's keys in order.

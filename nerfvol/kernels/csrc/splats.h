@@ -69,6 +69,7 @@ struct SplatReport {
 
 struct SplatKernels {
     void (*render)(const Splats&, const SplatView&, const SplatRenderOptions&, const SplatOutput&);
+    void (*points)(const Splats&, const SplatView&, const SplatRenderOptions&, const SplatOutput&);
     SplatReport (*step)(const Splats&, const SplatView&, const SplatImage&, const SplatLoss&, const SplatRates&, const SplatMemory&);
 };
 

@@ -1,8 +1,9 @@
-"""Points composited surface by surface, in numpy: correct before fast.
+"""Points composited surface by surface, in numpy and float64: what the kernels compute (csrc/point_render.h).
 
 Splats of points are footprints w = o rho exp(-d^T S^-1 d / 2) as in splat_reference. Per pixel [Zwicker et al. 2001]:
 
-- the distance of a disc is that of its plane at the pixel, 1/z being affine in pixels; a ball's is its mean's;
+- the distance of a disc is that of its plane at the pixel, 1/z being affine in pixels, but no more than 3 s from its
+  mean's, where the disc ends; a ball's is its mean's;
 - contributions no farther than 3 s behind the nearest one, s the point's deviation in space with the pixel's low pass, are
   one surface: its colour is sum w c / sum w, its opacity min(1, sum w);
 - the next surface begins with the nearest of the rest, and gets the transmittance that is left.
@@ -118,8 +119,9 @@ def _pixels(p: _Points, near: NDArray, x: Floats, y: Floats, view: SplatView, ep
     w = np.where(square <= REACH**2, p.weight[near] * np.exp(-0.5 * square), 0.0)
     inverse = p.plane[near, 0] * x[:, None] + p.plane[near, 1] * y[:, None] + p.plane[near, 2]
     z = p.depth[near]
-    # A plane seen edge on may be anywhere within a pixel: no farther than half and twice the point's own distance.
-    depth = 1 / np.where(p.plane[near].any(axis=1), np.clip(inverse, 0.5 / z, 2 / z), 1 / z)
+    slab = p.slab[near]
+    # A plane seen edge on may be anywhere within a pixel; the disc ends a slab from its mean.
+    depth = np.where(p.plane[near].any(axis=1), np.clip(1 / np.maximum(inverse, 1e-30), z - slab, z + slab), z)
     rest = w > 0
     passed = np.ones(len(x))
     out = {name: np.zeros((len(x), k)) for name, k in (("rgb", 3), ("normal", 3), ("depth", 1), ("median_depth", 1))}
@@ -130,7 +132,7 @@ def _pixels(p: _Points, near: NDArray, x: Floats, y: Floats, view: SplatView, ep
             break
         apart = np.where(rest, depth, np.inf)
         first = apart.argmin(axis=1)
-        limit = apart[np.arange(len(x)), first] + p.slab[near[first]]
+        limit = apart[np.arange(len(x)), first] + slab[first]
         one = rest & (depth <= np.where(seen, limit, -np.inf)[:, None])
         share = np.where(one, w, 0.0)
         total = share.sum(axis=1)
