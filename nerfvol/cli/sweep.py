@@ -79,7 +79,9 @@ def _on_cluster(options: SweepOptions, cells: list[dict[str, Any]]) -> Any:
 
     assert options.cluster is not None
     job = Job("nerfvol.measure.sweep:train_cell", {"threads": options.threads or 1})
-    folders = sorted({str(cell["settings"]["data"]) for cell in cells if Path(str(cell["settings"].get("data"))).is_dir()})
+    folders = sorted(
+        {str(cell["settings"]["data"]) for cell in cells if Path(str(cell["settings"].get("data"))).is_dir()}
+    )
     with connect(options.cluster) as client:
         window = Window(client, job, Needs(data=with_data(folders)), repeat_late=False)
         for message in window.messages:

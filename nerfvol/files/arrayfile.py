@@ -147,7 +147,9 @@ class ArrayFile:
         try:
             with self.path.open("rb") as file:
                 length = int.from_bytes(file.read(8), "little")
-                start = json.loads(file.read(length))[name]["data_offsets"][0]  # checked by the reader that opened the file
+                start = json.loads(file.read(length))[name]["data_offsets"][
+                    0
+                ]  # checked by the reader that opened the file
             # As a plain array: a memmap's own class slows down every view of it.
             return np.asarray(np.memmap(self.path, dtype, "c", 8 + length + start, shape))
         except (OSError, ValueError) as error:

@@ -77,19 +77,31 @@ def train_cell(settings: Mapping[str, Any], files: Mapping[str, Path], cell: Map
         return found
     folder.mkdir(parents=True, exist_ok=True)
     options = folder / "cell.yaml"
-    write_text(options, json.dumps({**cell["settings"], "out": str(folder), "threads": settings["threads"]}))  # is YAML too
-    command = [sys.executable, "-m", "nerfvol.cli", "train", "--config", str(options)]
+    write_text(
+        options, json.dumps({**cell["settings"], "out": str(folder), "threads": settings["threads"]})
+    )  # is YAML too
+    train = [sys.executable, "-m", "nerfvol.cli", "train"]
+    error = ""
     if (folder / CHECKPOINT).is_file() and _same(folder, cell):
-        command = [sys.executable, "-m", "nerfvol.cli", "train", "--resume", "--out", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL)
-    if done.returncode:
-        lines = [line for line in done.stderr.strip().splitlines() if line.strip()]
-        return {"error": lines[-1] if lines else f"it ended with code {done.returncode}"}
+        error = _run([*train, "--resume", "--out", str(folder)])
+    if error or finished(cell) is None:  # from the start, also where what lies there cannot be gone on with
+        error = _run([*train, "--config", str(options)])
+    if error:
+        return {"error": error}
     drawing = subprocess.run([sys.executable, "-c", _DRAW, str(folder)], capture_output=True, text=True)
     metrics = finished(cell)
     if metrics is None:
         return {"error": "it wrote no metrics"}
     return metrics | ({} if drawing.returncode == 0 else {"picture": "could not be drawn"})
+
+
+def _run(command: Sequence[str]) -> str:
+    """The last sentence of a command that fails, nothing where it does not."""
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", stdin=subprocess.DEVNULL)
+    if not done.returncode:
+        return ""
+    lines = [line for line in done.stderr.strip().splitlines() if line.strip()]
+    return lines[-1] if lines else f"it ended with code {done.returncode}"
 
 
 _DRAW = "import sys; from nerfvol.measure.sweep import draw; draw(sys.argv[1])"
@@ -140,7 +152,9 @@ def write_sweep(out: Path, cells: Sequence[Mapping[str, Any]], rows: Sequence[Ma
     write_text(out / "sweep.md", "\n".join(lines) + "\n")
     figures = []
     for cell, row in zip(cells, body, strict=True):
-        shown = html.escape("  ".join(f"{key} {value}" for key, value in zip(head[1:], row[1:], strict=True) if value != ""))
+        shown = html.escape(
+            "  ".join(f"{key} {value}" for key, value in zip(head[1:], row[1:], strict=True) if value != "")
+        )
         picture = f'<img src="{html.escape(cell["name"])}/{PICTURE}" alt="" loading="lazy">'
         figures.append(f"<figure>{'' if row[-1] else picture}<figcaption>{shown}</figcaption></figure>")
     write_text(out / "sweep.html", _PAGE.format(title=html.escape(out.name), figures="\n".join(figures)))
@@ -185,7 +199,11 @@ def _nested(base: Mapping[str, Any], values: Mapping[str, Any], source: str) -> 
 
 
 def _slug(values: Mapping[str, Any]) -> str:
-    parts = [f"{str(key).split('.')[-1]}={Path(v).name if key == 'data' else v}" for key, v in values.items() for v in [str(v)]]
+    parts = [
+        f"{str(key).split('.')[-1]}={Path(v).name if key == 'data' else v}"
+        for key, v in values.items()
+        for v in [str(v)]
+    ]
     return re.sub(r"[^A-Za-z0-9.=-]+", "_", "_".join(parts))[:60].strip("_.")
 
 
