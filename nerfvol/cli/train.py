@@ -40,7 +40,7 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")
     p.add_argument("--checkpoint-every", metavar="TIME", help="the most a crash can cost (default: 30s)")
-    p.add_argument("--storage", metavar="compact|float16|float32", help="how the model's file holds its values "
+    p.add_argument("--storage", metavar="compact|float16|float32|mapped", help="how the model's file holds its values "
                    "(default: compact)")  # fmt: skip
     p.add_argument("--set", action="append", metavar="KEY=VALUE", help="any setting of the sections, such as "
                    "octree.sh_degree=2; repeatable (config.yaml in a run folder lists them all)")  # fmt: skip

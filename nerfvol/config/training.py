@@ -338,8 +338,9 @@ class Config(Checked):
     """Go on from RUN's checkpoint."""
     checkpoint_every: Seconds = 30.0
     """Seconds between checkpoints."""
-    storage: Literal["float32", "float16", "compact"] = "compact"
-    """How octree files hold their values: exactly, halved, or quantised to about a tenth (docs/file_format.md)."""
+    storage: Literal["float32", "float16", "compact", "mapped"] = "compact"
+    """How octree files hold their values: exactly, halved, quantised to about a tenth, or as the kernels read them
+    (docs/file_format.md)."""
     compare_views: Count = 2
     """Held-out views on which field, distilled and fine-tuned octree are compared (a field renders slowly)."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)

@@ -7,6 +7,7 @@ is linear by convention, so they are decoded with the sRGB curve on the way.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import struct
 import subprocess
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
-from nerfvol.files.atomic import atomic_write
+from nerfvol.files.atomic import atomic_write, write_bytes
 
 Float = NDArray[np.float32]
 
@@ -28,13 +29,19 @@ def to_uint8(image: Float) -> NDArray[np.uint8]:
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def write_png(path: str | os.PathLike[str], image: NDArray[Any]) -> None:
-    """Write (H, W), (H, W, 3) or (H, W, 4) values in [0, 1] with 8 bits, or uint8/uint16 arrays as they are."""
+def encode_png(image: NDArray[Any]) -> bytes:
+    """A PNG of (H, W), (H, W, 3) or (H, W, 4) values in [0, 1] with 8 bits, or of uint8/uint16 arrays as they are."""
     from PIL import Image
 
     pixels = image if image.dtype in (np.uint8, np.uint16) else to_uint8(image)
-    with atomic_write(path) as temporary:
-        Image.fromarray(np.ascontiguousarray(pixels)).save(temporary, format="PNG", compress_level=4)
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", compress_level=4)
+    return buffer.getvalue()
+
+
+def write_png(path: str | os.PathLike[str], image: NDArray[Any]) -> None:
+    """Write :func:`encode_png` of ``image`` to ``path``."""
+    write_bytes(path, encode_png(image))
 
 
 def srgb_to_linear(image: Float) -> Float:

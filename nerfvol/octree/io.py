@@ -17,24 +17,25 @@ from nerfvol import __version__
 from nerfvol.errors import InputError
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.octree import codec
+from nerfvol.octree.rows import BLOCKS
 from nerfvol.octree.topology import number_corners
 from nerfvol.octree.tree import Octree
 
 FORMAT = "nerfvol octree"
-VERSION = 1
+VERSION, MAPPED_VERSION = 1, 2
 COLOUR_CONVENTION = "half_plus_sh"
 DENSITY_CONVENTION = "explin"
 LARGEST_VALUE = 1e6
 """Bound on |raw density| and |SH coefficient| when writing: far beyond any scene, far below float32 overflow. Files are
 read up to twice that, since quantisation may round a value at the bound upwards."""
 
-Storage = Literal["float32", "float16", "compact"]
+Storage = Literal["float32", "float16", "compact", "mapped"]
 
 
 def storage_of(name: str) -> Storage:
     """``name`` where it is one of Storage; InputError where it is not."""
     if name not in get_args(Storage):
-        raise InputError(f"storage should be float32, float16 or compact, got {name!r}")
+        raise InputError(f"storage should be {', '.join(get_args(Storage)[:-1])} or mapped, got {name!r}")
     return cast(Storage, name)
 
 
@@ -45,7 +46,8 @@ def save_octree(
 
     ``metadata`` is JSON-able and comes back from :func:`load_octree`; by custom it has "provenance" (data, command,
     seed, seconds), "background" and "orbit". ``storage``: "float32" is exact; "float16" halves the file; "compact" is
-    quantised and deflated to about a tenth (see nerfvol.octree.codec).
+    quantised and deflated to about a tenth (see nerfvol.octree.codec); "mapped" is exact and holds every array as the
+    kernels read it, so that it opens without a copy and processes share its pages (twice the size of "float32").
 
     Raises:
         InputError: no such storage, the path cannot be written, a value is not finite, or leaves that touch do not share their
@@ -63,7 +65,7 @@ def save_octree(
         raise InputError(f"cannot write {path}: the octree holds values beyond {LARGEST_VALUE:g} or not finite")
     document: dict[str, Any] = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": MAPPED_VERSION if storage == "mapped" else VERSION,
         "nerfvol": __version__,
         "storage": storage,
         "colour": COLOUR_CONVENTION,
@@ -82,11 +84,17 @@ def save_octree(
     if storage == "compact":
         planes, document["codec"] = codec.encode(density, sh)
         arrays.update(planes)
+    elif storage == "mapped":
+        arrays.update({name: getattr(octree, name) for name in _MAPPED})
     else:
         largest = np.finfo(storage).max
         arrays["density"] = np.clip(density, -largest, largest).astype(storage)
         arrays["sh"] = np.clip(sh, -largest, largest).astype(storage)
     return write_arrays(path, arrays, document)
+
+
+_MAPPED = ("leaf_level", "leaf_ijk", "corners", "values")
+"""What a mapped file holds beside the masks: see Octree's attributes."""
 
 
 def load_octree(path: str | os.PathLike[str]) -> tuple[Octree, dict[str, Any]]:
@@ -99,6 +107,8 @@ def load_octree(path: str | os.PathLike[str]) -> tuple[Octree, dict[str, Any]]:
         frame = _check_document(file)
         n_vertices, degree = frame.pop("n_vertices"), frame["sh_degree"]
         _check_arrays(file, n_vertices, (degree + 1) ** 2)
+        if file.document["storage"] == "mapped":
+            return _map_octree(file, frame), file.document["metadata"]
         node_mask, leaf_mask = file.read("node_mask"), file.read("leaf_mask")
         # Every leaf's lowest corner is its own, and a leaf has eight corners: a bound that holds before any is counted.
         n_leaves = int(np.unpackbits(leaf_mask).sum())
@@ -114,6 +124,16 @@ def load_octree(path: str | os.PathLike[str]) -> tuple[Octree, dict[str, Any]]:
         return octree, file.document["metadata"]
 
 
+def _map_octree(file: ArrayFile, frame: dict[str, Any]) -> Octree:
+    try:
+        octree = Octree.from_parts(*(file.map(name) for name in ("node_mask", "leaf_mask", *_MAPPED)), **frame)
+    except InputError as error:
+        raise file.fault(str(error)) from error
+    if not _bounded(octree.values, 2 * LARGEST_VALUE):
+        raise file.fault(f"some values are not finite or beyond {LARGEST_VALUE:g}")
+    return octree
+
+
 def describe_octree(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The JSON document in the header of ``path``, checked, without the arrays."""
     with ArrayFile(path, "octree file") as file:
@@ -126,13 +146,14 @@ def _check_document(file: ArrayFile) -> dict[str, Any]:
     document = file.document
     if document.get("format") != FORMAT:
         raise file.fault(f"expected the format {FORMAT!r}, it says {document.get('format')!r}")
-    if document.get("version") != VERSION:
-        raise file.fault(f"this nerfvol reads version {VERSION}, it has version {document.get('version')!r}")
+    if document.get("version") not in (VERSION, MAPPED_VERSION):
+        known = f"versions {VERSION} and {MAPPED_VERSION}"
+        raise file.fault(f"this nerfvol reads {known}, it has version {document.get('version')!r}")
     for key, known in (("colour", COLOUR_CONVENTION), ("density", DENSITY_CONVENTION)):
         if document.get(key) != known:
             raise file.fault(f"its {key} convention is {document.get(key)!r}, expected {known!r}")
-    if document.get("storage") not in ("float32", "float16", "compact"):
-        raise file.fault(f"its storage is {document.get('storage')!r}, expected float32, float16 or compact")
+    if document.get("storage") not in get_args(Storage):
+        raise file.fault(f"its storage is {document.get('storage')!r}, expected one of {', '.join(get_args(Storage))}")
     if not isinstance(document.get("metadata"), dict):
         raise file.fault("its metadata is not a JSON object")
     degree, n_vertices = document.get("sh_degree"), document.get("n_vertices")
@@ -157,7 +178,14 @@ def _check_arrays(file: ArrayFile, n_vertices: int, basis_dim: int) -> None:
     (n_nodes,) = file.expect("node_mask", "uint8", (None,))
     file.expect("leaf_mask", "uint8", (n_nodes,))
     storage = file.document["storage"]
-    if storage == "compact":
+    if storage == "mapped":
+        (n_leaves,) = file.expect("leaf_level", "int8", (None,))
+        file.expect("leaf_ijk", "int32", (n_leaves, 3))
+        file.expect("corners", "int32", (n_leaves, 8))
+        file.expect("values", "float32", (n_vertices, 16 * BLOCKS[file.document["sh_degree"]]))
+        if not n_leaves:
+            raise file.fault("it has no leaves")
+    elif storage == "compact":
         for name in codec.plane_names(basis_dim):
             file.expect(name, "uint8", (None,))
     else:

@@ -129,11 +129,16 @@ def pruned_masks(node_mask: np.ndarray, leaf_mask: np.ndarray, keep: np.ndarray)
 def level_starts(node_mask: np.ndarray) -> list[int]:
     """Where the nodes of each level begin, from the root's, and behind them where the last level ends.
 
-    node_mask: (n_nodes,) uint8; one number more than there are levels of nodes, the first 0, the last n_nodes.
+    node_mask: (n_nodes,) uint8; one number more than there are levels of nodes, the first 0, the last n_nodes. InputError
+    where nodes do not hang on the root or lie too deep.
     """
     starts = [0, 1]
     while starts[-1] < len(node_mask):
         starts.append(starts[-1] + int(POPCOUNT[node_mask[starts[-2] : starts[-1]]].sum()))
+        if starts[-1] == starts[-2]:  # links that sum up but loop: nodes that the walk from the root never meets
+            raise InputError(f"octree: only {starts[-1]} of {len(node_mask)} nodes hang on the root")
+        if len(starts) > MAX_LEVEL + 1:
+            raise InputError(f"octree: deeper than {MAX_LEVEL} levels")
     return starts
 
 

@@ -35,6 +35,7 @@ from nerfvol.octree.topology import (
     build_masks,
     find_sources,
     first_children,
+    level_starts,
     morton,
     number_corners,
     place_leaves,
@@ -101,6 +102,35 @@ class Octree:
             raise InputError("leaf positions must lie in [0, 2**level), some do not")
         node_mask, leaf_mask = build_masks(levels, cells)
         return cls(node_mask, leaf_mask, origin=origin, size=size, sh_degree=sh_degree, density_scale=density_scale)
+
+    @classmethod
+    def from_parts(
+        cls, node_mask: np.ndarray, leaf_mask: np.ndarray, leaf_level: np.ndarray, leaf_ijk: np.ndarray,
+        corners: np.ndarray, values: np.ndarray, *, origin: ArrayLike, size: float, sh_degree: int, density_scale: float,
+    ) -> Octree:  # fmt: skip
+        """An octree of arrays that are laid out already, as the attributes are: none is copied.
+
+        Raises InputError where they describe no octree that can be drawn: masks that loop, corners outside the vertices.
+        That corners are those of the leaves is not checked; wrong ones give a wrong picture.
+        """
+        self = cls.__new__(cls)
+        self.node_mask, self.leaf_mask = node_mask, leaf_mask
+        self.origin = np.asarray(origin, dtype=np.float64).reshape(3)
+        self.size, self.sh_degree, self.density_scale = float(size), int(sh_degree), float(density_scale)
+        _check_frame(self)
+        self.first_node, self.first_leaf = first_children(node_mask, leaf_mask)
+        levels = len(level_starts(node_mask)) - 1
+        if not len(corners) == len(leaf_level) == len(leaf_ijk) == int(POPCOUNT[leaf_mask].sum()):
+            raise InputError("octree: its masks have another number of leaves than its arrays")
+        if leaf_level.min() < 1 or leaf_level.max() > levels:
+            raise InputError("octree: leaves lie on levels that it does not have")
+        if leaf_ijk.min() < 0 or (leaf_ijk.max(1) >> leaf_level).any():
+            raise InputError("octree: leaves lie outside the root cube")
+        if corners.min() < 0 or corners.max() >= len(values):
+            raise InputError("octree: corners point outside the vertices")
+        self.leaf_level, self.leaf_ijk, self.corners = leaf_level, leaf_ijk, corners
+        self._values, self._n_vertices = values, len(values)
+        return self
 
     # ------------------------------------------------------------------ sizes and places
     @property

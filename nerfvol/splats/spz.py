@@ -166,7 +166,9 @@ def _require_memory(path: Path, count: int, degree: int) -> None:
     """Refuses Gaussians that do not fit: the library's arrays, ours and a copy of them."""
     need, have = 3 * 4 * count * (11 + 3 * (degree + 1) ** 2), total_memory()
     if have is not None and need > 0.8 * have:
-        raise _fault(path, f"its {count} Gaussians need {need / 2**30:.1f} GiB, and there are {have / 2**30:.1f} GiB of memory")
+        raise _fault(
+            path, f"its {count} Gaussians need {need / 2**30:.1f} GiB, and there are {have / 2**30:.1f} GiB of memory"
+        )
 
 
 def _check_gzip(path: Path, file: BinaryIO, wanted: int) -> None:

@@ -54,6 +54,49 @@ def test_float32_is_exact(tmp_path, degree):
     assert np.array_equal(octree.values, loaded.values)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_mapped_file_is_exact_and_opens_without_a_copy(tmp_path, degree):
+    octree = make_octree(degree, degree)
+    path = tmp_path / "o.safetensors"
+    save_octree(path, octree, {"a": 1}, "mapped")
+    before = path.read_bytes()
+    loaded, metadata = load_octree(path)
+    loaded.validate()
+    assert metadata == {"a": 1} and describe_octree(path)["version"] == io.MAPPED_VERSION
+    assert_same_topology(octree, loaded)
+    assert np.array_equal(octree.values, loaded.values)
+    # The kernels take rows and corners as they lie, on cache lines, in pages of the file.
+    kept = loaded.values
+    loaded.values = kept
+    assert loaded.values is kept and isinstance(kept.base, np.memmap)
+    assert all(array.ctypes.data % 64 == 0 for array in (loaded.values, loaded.corners))
+    loaded.density = 0.0  # this process's own copy
+    assert path.read_bytes() == before and np.array_equal(load_octree(path)[0].values, octree.values)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("corners", lambda a: np.where(a == a.max(), a.max() + 1, a), "corners point outside"),
+        ("corners", lambda a: a - 1, "corners point outside"),
+        ("leaf_level", lambda a: a + 1, "levels that it does not have"),
+        ("leaf_ijk", lambda a: a + 8, "outside the root cube"),
+        ("leaf_mask", lambda a: np.zeros_like(a), "no leaves"),
+        ("node_mask", lambda a: np.roll(a, 1), "hang on the root|both as an interior"),
+        ("values", lambda a: np.full_like(a, np.nan), "not finite"),
+        ("values", lambda a: a[:-1], "shape"),
+    ],
+)  # fmt: skip
+def test_a_lying_mapped_file_is_refused(tmp_path, name, change, message):
+    path = tmp_path / "o.safetensors"
+    save_octree(path, make_octree(), {}, "mapped")
+    arrays, metadata = load_file(path), json.dumps(describe_octree(path))
+    arrays[name] = np.ascontiguousarray(change(arrays[name]).astype(arrays[name].dtype))
+    save_file(arrays, path, {"nerfvol": metadata})
+    with pytest.raises(InputError, match=message):
+        load_octree(path)
+
+
 def test_float16_is_rounded_once(tmp_path):
     octree = make_octree()
     save_octree(tmp_path / "o.safetensors", octree, {}, "float16")
@@ -194,7 +237,7 @@ def with_value(value):
 BOMB = np.frombuffer(zlib.compress(b"\0" * 50_000_000), np.uint8)
 HOSTILE = {
     "other format": (dict(document={"format": "pickle"}), "expected the format"),
-    "newer version": (dict(document={"version": 2}), "reads version 1"),
+    "newer version": (dict(document={"version": 3}), "reads versions 1 and 2"),
     "other colour": (dict(document={"colour": "sigmoid_sh"}), "colour convention"),
     "other density": (dict(document={"density": "softplus"}), "density convention"),
     "unknown storage": (dict(document={"storage": "exe"}), "storage"),

@@ -30,7 +30,20 @@ MOST_BYTES = 64 << 20
 MOST_SECONDS = 20.0
 """Nothing of the kind takes a tenth; more is a loop that goes by a number in the file."""
 NUMBERS = (0, 1, 255, 1 << 16, (1 << 31) - 1, (1 << 32) - 1)
-WORDS = (b"-1", b"0", b"1e9", b"99999999999999999999", b"nan", b"list", b"double", b"char", b"\n", b"", b"ascii", b"vertex")
+WORDS = (
+    b"-1",
+    b"0",
+    b"1e9",
+    b"99999999999999999999",
+    b"nan",
+    b"list",
+    b"double",
+    b"char",
+    b"\n",
+    b"",
+    b"ascii",
+    b"vertex",
+)
 
 
 def damaged(data: bytes, random: np.random.Generator) -> bytes:

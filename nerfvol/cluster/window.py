@@ -1,0 +1,206 @@
+"""A job's results in the order of its items, with a bounded number of them on their way."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import statistics
+import time
+import uuid
+from collections.abc import Coroutine, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED
+from concurrent.futures import Future as Fetch
+from concurrent.futures import wait as wait_for
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+from nerfvol.cluster import ship
+from nerfvol.cluster.fit import Needs, fit_workers, welcome
+from nerfvol.cluster.tasks import Done, Job, Missing, run
+from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+TASKS_A_WORKER = 3
+"""On their way at once: one that runs, one that waits there, one whose result travels."""
+TASK_SECONDS = 0.5
+"""A task takes at least about this long, so that its 2-3 ms of scheduling do not count."""
+PATIENCE_FACTOR, LEAST_PATIENCE = 5.0, 10.0
+ATTEMPTS = 5
+
+
+@dataclass
+class _Task:
+    """Items first...last-1 given out; future: the engine's; attempts: which try this is."""
+
+    first: int
+    last: int
+    future: Future
+    started: float
+    attempts: int
+
+
+class Window:
+    """Runs a job on a client's workers. ``messages``: sentences on workers that take no part.
+
+    repeat_late: items that take five times as long as others are given out once more; not where two may not write one folder.
+    """
+
+    def __init__(self, client: Client, job: Job, needs: Needs, repeat_late: bool = True) -> None:
+        self.client, self.job, self.repeat_late = client, job, repeat_late
+        self.resource, self.messages = welcome(client, needs)
+        self._id = uuid.uuid4().hex[:8]
+        self._times: list[float] = []
+        self._fit: list[str] = []
+        self._silent: set[str] = set()
+        self._asked = -1e9
+        self._tasks: dict[Fetch[Any], _Task] = {}
+
+    def results(self, items: Sequence[Any]) -> Iterator[Any]:
+        """The function's result for each of ``items``, in their order.
+
+        Raises:
+            InputError: the engine is gone, or a task fails wherever it is tried.
+        """
+        ready: dict[int, Done] = {}
+        submitted = yielded = 0
+        try:
+            while yielded < len(items):
+                while (
+                    submitted < len(items)
+                    and submitted - yielded < TASKS_A_WORKER * len(self._workers()) * self._group()
+                ):
+                    last = min(submitted + self._group(), len(items))
+                    self._submit(items, submitted, last)
+                    submitted = last
+                for first, done in self._finished(items):
+                    if first >= yielded:
+                        ready[first] = done
+                        self._forget_tries_of(first)
+                self._repeat_a_late_one(items, yielded)
+                while yielded in ready:
+                    results = ready.pop(yielded).results
+                    yielded += len(results)
+                    yield from results
+        finally:
+            for fetch, task in self._tasks.items():
+                self._release(fetch, task)
+            self._tasks.clear()
+
+    def _workers(self) -> list[str]:
+        """Addresses that may take tasks, asked of the scheduler once a second; without the silent ones, if others are left."""
+        if time.monotonic() - self._asked > 1.0:
+            try:
+                self._fit = fit_workers(self.client, self.resource)
+            except (KeyError, OSError, ValueError) as error:
+                raise self._gone() from error
+            self._asked = time.monotonic()
+        return [address for address in self._fit if address not in self._silent] or self._fit or [""]
+
+    def _group(self) -> int:
+        """Items a task."""
+        if not self._times:
+            return 1
+        least = max(TASK_SECONDS, 0.005 * len(self._workers()))
+        return max(1, min(64, round(least / max(statistics.median(self._times[-50:]), 1e-4))))
+
+    def _submit(self, items: Sequence[Any], first: int, last: int, attempts: int = 1) -> None:
+        key = f"nerfvol-{self._id}-{first}-{attempts}-{uuid.uuid4().hex[:4]}"
+        where = {"workers": self._workers(), "allow_other_workers": True} if self._silent else {}
+        try:
+            future = self.client.submit(
+                run, self.job, list(items[first:last]), self.resource,
+                key=key, resources={self.resource: 1}, retries=3, pure=False, **where,
+            )  # fmt: skip
+        except Exception as error:
+            raise self._gone() from error
+        # Each result is fetched for itself: one that lies on a frozen worker does not hold up the others.
+        loop = cast(Any, self.client.loop).asyncio_loop
+        gathering = cast(Coroutine[Any, Any, Any], self.client.gather([future], asynchronous=True))
+        fetch = asyncio.run_coroutine_threadsafe(gathering, loop)
+        self._tasks[fetch] = _Task(first, last, future, time.monotonic(), attempts)
+
+    def _finished(self, items: Sequence[Any]) -> Iterator[tuple[int, Done]]:
+        """Waits a moment for tasks; what they gave, by the first item. What could not run is given out again."""
+        wait_for(list(self._tasks), timeout=0.5, return_when=FIRST_COMPLETED)
+        if self.client.status not in ("running", "connecting"):
+            raise self._gone()
+        for fetch in [fetch for fetch in self._tasks if fetch.done()]:
+            task = self._tasks.pop(fetch, None)
+            if task is None:  # another try of the same items came first
+                continue
+            error = fetch.exception()
+            if error is not None:
+                self._failed(items, task, error)
+                continue
+            (result,) = fetch.result()
+            if isinstance(result, Missing):
+                self._bring(result)
+                self._submit(items, task.first, task.last, task.attempts)
+                continue
+            assert isinstance(result, Done)
+            self._silent.discard(result.worker)
+            self._times.append(result.seconds / max(1, len(result.results)))
+            yield task.first, result
+
+    def _bring(self, missing: Missing) -> None:
+        for file in missing.files:
+            try:
+                ship.send(self.client, file, missing.worker)
+            except Exception as error:
+                if isinstance(error, OSError) and error.filename == file.path:
+                    raise InputError(f"cannot read {file.path} to send it to {missing.worker}") from error
+                # The worker died, or its disk is full: the task finds another.
+
+    def _failed(self, items: Sequence[Any], task: _Task, error: BaseException) -> None:
+        from distributed.client import FutureCancelledError
+        from distributed.scheduler import KilledWorker
+
+        if isinstance(error, InputError):
+            raise error
+        if isinstance(error, FutureCancelledError | asyncio.CancelledError):
+            raise self._gone() from error
+        if task.attempts >= ATTEMPTS or not isinstance(error, KilledWorker):
+            raise InputError(
+                f"item {task.first} fails on the cluster's workers: {type(error).__name__}: {error}"
+            ) from error
+        self._submit(items, task.first, task.last, task.attempts + 1)
+
+    def _repeat_a_late_one(self, items: Sequence[Any], oldest: int) -> None:
+        """The oldest items that are missing are given out once more after five times what they take: who has them is frozen,
+        perhaps. The same bits come from anyone, and the first to come counts."""
+        tries = [task for task in self._tasks.values() if task.first == oldest]
+        if not tries or not self._times or not self.repeat_late:
+            return
+        task = tries[-1]
+        usual = statistics.median(self._times) * (task.last - task.first)
+        late = time.monotonic() - task.started > max(LEAST_PATIENCE, PATIENCE_FACTOR * usual)
+        if late and len(tries) < ATTEMPTS:
+            self._silent.update(self._holders(task.future))
+            self._submit(items, task.first, task.last, task.attempts + 1)
+
+    def _holders(self, future: Future) -> list[str]:
+        """Who runs a task or holds its result."""
+        try:
+            if future.status == "finished":
+                return list(cast(dict[str, Any], self.client.who_has([future]))[str(future.key)])
+            processing = cast(dict[str, Any], self.client.processing())
+            return [address for address, keys in processing.items() if future.key in keys]
+        except (OSError, KeyError, ValueError):
+            return []
+
+    def _forget_tries_of(self, first: int) -> None:
+        for fetch in [fetch for fetch, task in self._tasks.items() if task.first == first]:
+            self._release(fetch, self._tasks.pop(fetch))
+
+    @staticmethod
+    def _release(fetch: Fetch[Any], task: _Task) -> None:
+        with contextlib.suppress(Exception):  # the engine may be gone
+            fetch.cancel()
+            task.future.cancel(force=True)
+
+    def _gone(self) -> InputError:
+        return InputError(
+            "--cluster: the scheduler is gone; what was written stays, and the same command goes on from there"
+        )

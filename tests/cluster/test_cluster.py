@@ -1,0 +1,192 @@
+"""Work on an engine's workers: in order, the same bytes, nothing lost or twice, whoever dies.
+
+The engine is real (two processes of this machine); one of them serves all tests but those that end it.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
+
+from nerfvol.cluster import fit, ship, window
+from nerfvol.cluster.engine import connect
+from nerfvol.cluster.fit import Fit, Needs
+from nerfvol.cluster.tasks import Job
+from nerfvol.cluster.window import Window
+from nerfvol.errors import InputError
+from tests.cluster.work import keep_files_in
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.filterwarnings("ignore")  # the engine's own, of ports and loops
+
+
+@pytest.fixture(scope="module")
+def client():
+    with connect("local:2") as found:
+        yield found
+
+
+def job(name: str, **settings) -> Job:
+    return Job(f"tests.cluster.work:{name}", settings)
+
+
+def workers(client) -> dict[str, int]:
+    """Process numbers by address."""
+    return client.run(os.getpid)
+
+
+@pytest.mark.parametrize("seconds", (0.0, 0.02))
+def test_results_come_once_and_in_order_from_all_workers(client, seconds):
+    results = list(Window(client, job("double", seconds=seconds), Needs()).results(range(120)))
+    assert [value for value, _ in results] == [2 * k for k in range(120)]
+    assert {process for _, process in results} == set(workers(client).values())
+
+
+def test_no_more_is_on_its_way_than_the_window_says(client):
+    taken = []
+
+    class Items(list):
+        def __getitem__(self, key):
+            taken.append(key.stop)
+            return super().__getitem__(key)
+
+    running = Window(client, job("double", seconds=0.3), Needs()).results(Items(range(40)))
+    next(running)
+    time.sleep(1.5)  # nobody asks for more: nothing more may be given out
+    assert max(taken) <= 2 * (2 * window.TASKS_A_WORKER + 1)  # tasks of at most two items
+    running.close()
+
+
+def test_a_killed_worker_loses_nothing(client):
+    results = Window(client, job("double", seconds=0.03), Needs()).results(range(100))
+    found = [next(results)]
+    os.kill(sorted(workers(client).values())[0], signal.SIGKILL)
+    assert [value for value, _ in [*found, *results]] == [2 * k for k in range(100)]
+
+
+def test_a_frozen_worker_holds_nothing_up(client, monkeypatch):
+    monkeypatch.setattr(window, "LEAST_PATIENCE", 0.5)
+    results = Window(client, job("double", seconds=0.03), Needs()).results(range(60))
+    found = [next(results)]
+    frozen = sorted(workers(client).values())[0]
+    os.kill(frozen, signal.SIGSTOP)
+    started = time.monotonic()
+    try:
+        assert [value for value, _ in [*found, *results]] == [2 * k for k in range(60)]
+    finally:
+        os.kill(frozen, signal.SIGCONT)
+    assert time.monotonic() - started < 25  # the engine itself would give it up after 30 s
+
+
+def test_files_are_sent_where_they_are_not(client, tmp_path, monkeypatch):
+    content = os.urandom(3 * ship.PART + 17)
+    client.run(keep_files_in, str(tmp_path / "cache"))
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "model.bin").write_bytes(content)
+    with (tmp_path / "model.bin").open("rb") as file:
+        here_alone = f"/proc/self/fd/{file.fileno()}"  # another file, or none, in every other process
+        described = ship.describe(tmp_path / "model.bin")
+        shipped = ship.Shipped(described.sha256, described.size, here_alone, ".bin")
+        sent = Job("tests.cluster.work:content", {}, {"model": shipped})
+        results = list(Window(client, sent, Needs()).results(range(4)))
+    assert all(result == content for result in results)
+    assert [path.name for path in (tmp_path / "cache").iterdir()] == [f"{described.sha256}.bin"]
+
+
+def test_what_arrives_otherwise_than_it_was_is_not_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("NERFVOL_CACHE", str(tmp_path))
+    with pytest.raises(OSError, match="changed while it was sent"):
+        ship.receive(ship.Shipped("0" * 64, 3, "/m", ".bin"), 0, b"abc")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_takes_its_worker_out(client, tmp_path):
+    results = list(Window(client, job("no_space_on", file=str(tmp_path / "who")), Needs(room=1)).results(range(20)))
+    assert results == [2 * k for k in range(20)]
+
+
+def test_what_fails_everywhere_is_one_sentence(client):
+    with pytest.raises(InputError, match="RuntimeError: this never works"):
+        list(Window(client, job("broken"), Needs()).results(range(4)))
+
+
+def test_workers_that_draw_otherwise_are_named(client):
+    with pytest.raises(InputError) as caught:
+        fit.welcome(client, Needs(probes=("tests.cluster.work:other_probe",)), patience=2.0)
+    assert all(address in str(caught.value) for address in workers(client))
+    assert "draws other pictures" in str(caught.value)
+
+
+def test_fit_asks_for_kernels_data_and_room(tmp_path, monkeypatch):
+    monkeypatch.setenv("NERFVOL_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "a.png").write_bytes(b"1")
+    mine = Needs(data=fit.with_data([tmp_path / "scene"]))
+    expected = fit.fingerprint(mine)
+    assert Fit(mine, expected).reason() == ""
+    assert "draws other pictures" in Fit(mine, "0" * 16).reason()
+    (tmp_path / "scene" / "b.png").write_bytes(b"2")
+    assert "holds other files" in Fit(mine, expected).reason()
+    (tmp_path / "scene").rename(tmp_path / "elsewhere")
+    assert "is not there" in Fit(mine, expected).reason()
+    assert "are needed" in Fit(Needs(room=10**18), expected).reason()
+
+
+def test_another_instruction_set_has_another_fingerprint():
+    """Baseline kernels round otherwise than those with fused multiply-add."""
+    from nerfvol.kernels import ops
+
+    if ops.isa() not in ("avx2", "avx512"):
+        pytest.skip(f"these kernels are {ops.isa()}: there is nothing to tell them from")
+    code = "from nerfvol.cluster import fit; print(fit.fingerprint(fit.Needs()))"
+    prints = {}
+    for isa in (ops.isa(), "baseline"):
+        environment = {**os.environ, "NERFVOL_ISA": isa}
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+        prints[isa] = done.stdout.strip()
+    assert prints["baseline"] != prints[ops.isa()] == fit.fingerprint(Needs())
+
+
+def test_a_scheduler_that_dies_is_one_sentence(tmp_path):
+    file = tmp_path / "scheduler.json"
+    starter = "import sys; from distributed.cli.dask_{0} import main; main(sys.argv[1:])"
+    arguments = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    arguments_of_worker = ["--scheduler-file", str(file), "--no-dashboard", "--nthreads", "1", "--no-nanny"]
+    with contextlib.ExitStack() as stack:
+
+        def start(what: str, given: list[str]) -> subprocess.Popen:
+            command = [sys.executable, "-c", starter.format(what), *given]
+            process = stack.enter_context(subprocess.Popen(command, stderr=subprocess.DEVNULL, cwd=ROOT))
+            stack.callback(process.kill)
+            return process
+
+        scheduler = start("scheduler", arguments)
+        while not file.exists() or not file.read_text():
+            assert scheduler.poll() is None
+            time.sleep(0.05)
+        start("worker", arguments_of_worker)
+        with connect(str(file)) as client:
+            results = Window(client, job("double", seconds=0.05), Needs()).results(range(400))
+            assert next(results)[0] == 0
+            scheduler.kill()
+            with pytest.raises(InputError, match="scheduler is gone"):
+                list(results)
+
+
+@pytest.mark.parametrize("where", ("local:0", "local:many", "nowhere", "tcp://127.0.0.1:9"))
+def test_what_cannot_be_reached_is_one_sentence(where, monkeypatch):
+    monkeypatch.setattr("nerfvol.cluster.engine.CONNECT_SECONDS", 1.0)
+    with pytest.raises(InputError, match="--cluster"), connect(where):
+        pass
+
+
+def test_the_package_imports_no_engine():
+    code = "import sys, nerfvol, nerfvol.cli.main; print('distributed' in sys.modules or 'dask' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
