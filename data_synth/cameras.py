@@ -82,7 +82,7 @@ def look_at(eye: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), up: ArrayLike =
     eye, target, up = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     back = eye - target
     right = np.cross(up, back)
-    if np.linalg.norm(back) == 0 or np.linalg.norm(right) < 1e-12:
+    if np.linalg.norm(right) <= 1e-12 * np.linalg.norm(back) * np.linalg.norm(up):
         raise InputError("look_at: eye must differ from target and the view must not be parallel to up")
     back /= np.linalg.norm(back)
     right /= np.linalg.norm(right)

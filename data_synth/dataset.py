@@ -56,13 +56,13 @@ class Renderable(Protocol):
     exposure: float
     parameters: dict
 
-    def render(self, camera: Camera) -> Picture: ...
+    def render(self, camera: Camera, *, seed: int = 0) -> Picture: ...
 
 
 def render_view(scene: Renderable, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
     """One view of any scene: by ``integrator`` if given, else the way the scene prefers."""
     if integrator is None:
-        return scene.render(camera)
+        return scene.render(camera, seed=seed)
     if not isinstance(scene, Scene):
         raise InputError(f"--integrator: the {scene.name} renders itself, got {integrator}")
     return integrator.render(scene, camera, seed=seed)

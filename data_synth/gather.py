@@ -25,9 +25,10 @@ from data_synth.cameras import pixel_ray
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
 from data_synth.media import BRICK, GRID, Medium, box_interval, lookup, triple
+from data_synth.rng import new_rng
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, mul, sub, unit
-from data_synth.world import World, blocked, has_surfaces
+from data_synth.world import SURFACES, World, has_boundaries, has_surfaces, visible
 
 OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
 SIDE = BRICK + 1
@@ -47,7 +48,7 @@ def possible(w: World) -> bool:
     m = w.medium
     grey = m.sigma_t[0] == m.sigma_t[1] == m.sigma_t[2]
     distant = bool(np.all(w.lights[:, 0] == DIRECTIONAL))
-    return m.kind == GRID and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not w.bounded
+    return m.kind == GRID and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not has_boundaries(w)
 
 
 def outside(m: Medium, eye: np.ndarray) -> bool:
@@ -70,7 +71,7 @@ def gather(w: World) -> Gathered:
         windows = np.lib.stride_tricks.sliding_window_view(swept, (SIDE,) * 3)[::BRICK, ::BRICK, ::BRICK]
         np.exp(np.float32(-m.sigma_t[0]) * windows[brick].ravel(), out=T[k])
         if has_surfaces(w):
-            _block(w, corner, k, T)
+            _block(w, corner, k, new_rng(0, 0), T)
 
     in_parallel(light, [(k,) for k in range(len(w.lights))])
     return Gathered(corner, T)
@@ -96,13 +97,13 @@ def sample_point(m, corner, b, s):
 
 
 @kernel
-def _block(w, corner, k, T):
-    """Surfaces keep light k from the samples behind them."""
+def _block(w, corner, k, rng, T):
+    """Surfaces and lamps keep light k from the samples behind them. rng: nothing is drawn from it."""
     towards_light = column3(w.lights, k, 7)
     for b in range(corner.shape[0]):
         for s in range(SAMPLES):
-            if blocked(w, (sample_point(w.medium, corner, b, s), towards_light), math.inf):
-                T[k, b * SAMPLES + s] = 0.0
+            p = sample_point(w.medium, corner, b, s)
+            T[k, b * SAMPLES + s] *= visible(w, (p, towards_light), math.inf, 0, SURFACES, rng)[0]
 
 
 @jit
@@ -184,17 +185,25 @@ def look_up(m, v, p):
     return trilinear(v, a, fu, fv, fw)
 
 
+class Clear(NamedTuple):
+    """What a ray has met so far in a grey medium: radiance, transmittance, and the sum of weight times distance."""
+
+    L: tuple[float, float, float]
+    T: float
+    far: float
+
+
 @jit
 def gathered_event(m, ray, t, width, state, context):
-    """One marching step; state = (L rgb, T, sum of weight times distance)."""
+    """One marching step."""
     rho_J, ray_in_cells, base = context
     x = look_up(m, rho_J, along(ray_in_cells, t))
     if x[0] <= 0.0:
         return state, False
-    T = state[3] * math.exp(-x[0] * width * m.sigma_t[0])
-    weight = state[3] - T
-    L = (state[0] + weight * x[1], state[1] + weight * x[2], state[2] + weight * x[3])
-    return (L[0], L[1], L[2], T, state[4] + weight * (base + t)), T < OPAQUE
+    T = state.T * math.exp(-x[0] * width * m.sigma_t[0])
+    weight = state.T - T
+    L = (state.L[0] + weight * x[1], state.L[1] + weight * x[2], state.L[2] + weight * x[3])
+    return Clear(L, T, state.far + weight * (base + t)), T < OPAQUE
 
 
 _march = traversal(steps(gathered_event))
@@ -202,7 +211,7 @@ _march = traversal(steps(gathered_event))
 
 @jit
 def march_gathered(m, rho_J, ray, t0, t1, base, state):
-    """Fold [t0, t1] of a ray through the medium into state = (L rgb, T, sum of weight times distance)."""
+    """Fold [t0, t1] of a ray through the medium into a state (``Clear``)."""
     o, d, cell = sub(ray[0], m.lo), ray[1], m.cell
     in_cells = ((o[0] / cell[0], o[1] / cell[1], o[2] / cell[2]), (d[0] / cell[0], d[1] / cell[1], d[2] / cell[2]))
     return _march(m, ray, t0, t1, True, state, (rho_J, in_cells, base))[0]
@@ -219,7 +228,7 @@ def render_rows(m, rho_J, camera, side, out, first, last):
             for s in range(side * side):
                 ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
                 t0, t1 = box_interval(ray, m.lo, m.hi)
-                x = march_gathered(m, rho_J, ray, t0, t1, 0.0, (0.0, 0.0, 0.0, 1.0, 0.0))
-                r, g, b, alpha, far = r + x[0], g + x[1], b + x[2], alpha + 1.0 - x[3], far + x[4]
+                x = march_gathered(m, rho_J, ray, t0, t1, 0.0, Clear((0.0, 0.0, 0.0), 1.0, 0.0))
+                r, g, b, alpha, far = r + x.L[0], g + x.L[1], b + x.L[2], alpha + 1.0 - x.T, far + x.far
             out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * share, g * share, b * share
             out[j, i, 3], out[j, i, 4] = alpha * share, far * share

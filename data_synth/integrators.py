@@ -30,6 +30,7 @@ from data_synth.world import World, has_surfaces
 if TYPE_CHECKING:
     from data_synth.scene import Scene
 
+UNLIMITED = 2**62
 MAP_RESOLUTION = 96  # samples along the longest side of a deep shadow map, unless told otherwise
 
 
@@ -45,13 +46,13 @@ class March:
 
     beams: int = 12
     side: int = 1
-    mode: int = field(default=march.MARCHED, repr=False)
+    mode: int = field(default=march.BY_RAYS, repr=False)
 
     def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
         return shadowmap.none(), None
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
-        world, backdrop, maps, gathered = _prepared(self, scene)
+        world, maps, gathered = _prepared(self, scene)
         eye, mode, rho_J = camera.c2w[:3, 3], self.mode, np.empty(0, np.float32)
         if gathered is not None:
             if not gather.outside(world.medium, eye):
@@ -64,9 +65,7 @@ class March:
             if mode == march.GATHERED and not has_surfaces(world) and not scene.opaque_sky:
                 gather.render_rows(world.medium, rho_J, data, self.side, out, first, last)
             else:
-                march.render_rows(
-                    world, backdrop, lighting, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last
-                )
+                march.render_rows(world, lighting, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last)
 
         in_bands(rows, camera.height, 4)
         return Picture(out[..., :3], out[..., 3], out[..., 4], samples=self.side**2)
@@ -109,23 +108,27 @@ class DeepShadow(March):
 
 @dataclass(frozen=True)
 class Path:
-    """Volumetric path tracing: ``spp`` paths per pixel of at most ``max_depth`` scattering events (1 = single).
+    """Volumetric path tracing: ``spp`` paths per pixel. max_depth: the most scattering events of a path (1 = single).
 
+    Without max_depth there is no limit: Russian roulette ends paths, and all orders of scattering are there.
     jitter: paths start anywhere in the pixel (a box filter) instead of at its centre.
     """
 
     spp: int = 32
-    max_depth: int = 64
+    max_depth: int | None = None
     jitter: bool = True
 
     def __post_init__(self) -> None:
-        if self.spp < 1 or self.max_depth < 0:
-            raise InputError(f"--spp: expected at least 1 sample and depth >= 0, got {self.spp} and {self.max_depth}")
+        if self.spp < 1:
+            raise InputError(f"--spp: expected at least 1 sample, got {self.spp}")
+        if self.max_depth is not None and self.max_depth < 0:
+            raise InputError(f"--max-depth: expected 0 or more, got {self.max_depth}")
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
         world = _prepared(self, scene).world
         out, data = np.empty((camera.height, camera.width, 8)), camera.data()
-        settings = path.Settings(self.spp, self.max_depth, self.jitter, scene.opaque_sky, seed)
+        depth = UNLIMITED if self.max_depth is None else self.max_depth
+        settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed)
 
         def rows(first: int, last: int) -> None:
             path.render_rows(world, data, settings, new_rng(0, 0), out, first, last)
@@ -150,21 +153,19 @@ class Prepared(NamedTuple):
     """What an integrator makes of a scene, whatever the camera."""
 
     world: World
-    backdrop: np.ndarray
     maps: ShadowMaps
     gathered: Gathered | None
 
 
 def _prepared(integrator: March | Path, scene: Scene) -> Prepared:
-    """Arrays and shadow maps of a scene for an integrator, kept on the scene: they do not depend on the camera."""
-    store = scene.prepared
-    if integrator not in store:
+    """Arrays and shadow maps of a scene for an integrator, kept on the scene for as long as nothing in it changes."""
+    store, key = scene.prepared, (integrator, scene.fingerprint())
+    if key not in store:
         while len(store) > 1:
             store.pop(next(iter(store)))
         if isinstance(integrator, Path):
-            store[integrator] = Prepared(scene.world(), np.zeros((0, 16)), shadowmap.none(), None)
+            store[key] = Prepared(scene.world(), shadowmap.none(), None)
         else:
             world = scene.world(integrator.beams)
-            backdrop = np.array(scene.lights, float).reshape(-1, 16)
-            store[integrator] = Prepared(world, backdrop, *integrator._light(scene, world))
-    return store[integrator]
+            store[key] = Prepared(world, *integrator._light(scene, world))
+    return store[key]

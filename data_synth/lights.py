@@ -1,9 +1,11 @@
 """Lights (PHYSICS 7). A light table is a (n, 16) float array; each row is made by a function below.
 
-Columns: kind, 0, 0, 0 | r, g, b | position or direction towards the light (3) | per kind.
+Columns: kind, back, 0, 0 | r, g, b | position or direction towards the light (3) | per kind.
     point        intensity I in W/sr:          arriving irradiance I / r^2
+    spot         a piece of a quad light seen from afar: intensity I cos(theta) about the unit normal in columns 10-12
     directional  irradiance across its beam
-    quad         radiance of one face of a parallelogram; columns 10-12, 13-15 are its edge vectors
+    quad         radiance of one face of a parallelogram; columns 10-12, 13-15 are its edge vectors. Whatever runs into
+                 that face ends there. The other face is black (back 1) or lets all light through (back 0)
     sky          radiance from infinity: columns 4-6 at the zenith, 7-9 at the horizon, 10-12 below; constant if equal
 """
 
@@ -19,9 +21,10 @@ from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.media import rgb
 from data_synth.rng import uniform
-from data_synth.vec import along, cross, dot, scale, sphere_direction, sub
+from data_synth.surfaces import RELATIVE
+from data_synth.vec import along, cross, dot, extent, scale, sphere_direction, sub
 
-POINT, DIRECTIONAL, QUAD, SKY = range(4)
+POINT, DIRECTIONAL, QUAD, SKY, SPOT = range(5)
 WIDTH = 16
 
 
@@ -46,9 +49,18 @@ def directional(towards: ArrayLike, irradiance: ArrayLike) -> np.ndarray:
     return _row(DIRECTIONAL, rgb(irradiance, "irradiance"), direction / np.linalg.norm(direction))
 
 
-def quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, radiance: ArrayLike) -> np.ndarray:
-    """The parallelogram corner + [0,1] edge_u + [0,1] edge_v; it radiates on the side of edge_u x edge_v."""
-    return _row(QUAD, rgb(radiance, "radiance"), corner, edge_u, edge_v)
+def quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, radiance: ArrayLike, back: str = "black") -> np.ndarray:
+    """The parallelogram corner + [0,1] edge_u + [0,1] edge_v; it radiates on the side of edge_u x edge_v.
+
+    back: "black", a panel that also throws a shadow; or "clear", a lamp that is not there when seen from behind.
+    """
+    if back not in ("black", "clear"):
+        raise InputError(f"quad: back must be black or clear, got '{back}'")
+    row = _row(QUAD, rgb(radiance, "radiance"), corner, edge_u, edge_v)
+    if not np.any(np.cross(row[10:13], row[13:16])):
+        raise InputError(f"quad: expected edges that span a parallelogram, got {edge_u} and {edge_v}")
+    row[1] = back == "black"
+    return row
 
 
 def environment(radiance: ArrayLike) -> np.ndarray:
@@ -62,10 +74,9 @@ def sky(zenith: ArrayLike, horizon: ArrayLike, ground: ArrayLike) -> np.ndarray:
 
 
 def discretise(rows: list[np.ndarray], n: int) -> list[np.ndarray]:
-    """Sky and quad lights as n directional or n x n point lights, for integrators that sum over beams.
+    """Sky and quad lights as n directional or about n spot lights, for integrators that sum over beams.
 
-    Sky directions lie on a Fibonacci sphere, each with the irradiance of 4 pi / n steradians. A quad's points keep only
-    the side they radiate to through their count: they radiate to both sides alike.
+    Sky directions lie on a Fibonacci sphere, each with the irradiance of 4 pi / n steradians.
     """
     beams = []
     for row in rows:
@@ -79,11 +90,12 @@ def discretise(rows: list[np.ndarray], n: int) -> list[np.ndarray]:
                     beams.append(directional(d, irradiance))
         elif row[0] == QUAD:
             side = max(int(math.sqrt(n)), 1)
-            area = np.linalg.norm(np.cross(row[10:13], row[13:16]))
+            normal = np.cross(row[10:13], row[13:16])
+            area = np.linalg.norm(normal)
             for k in range(side * side):
                 u, v = (k % side + 0.5) / side, (k // side + 0.5) / side
                 p = row[7:10] + u * row[10:13] + v * row[13:16]
-                beams.append(point(p, row[4:7] * area / side**2))
+                beams.append(_row(SPOT, row[4:7] * area / side**2, p, normal / area))
         else:
             beams.append(row)
     return beams
@@ -136,9 +148,7 @@ def sample_light(lights, k, p, rng):
         wi = sphere_direction((0.0, 0.0, 1.0), 1.0 - 2.0 * uniform(rng), 2.0 * math.pi * uniform(rng))
         s = sky_blend(colour, column3(lights, k, 7), column3(lights, k, 10), wi[2])
         return wi, math.inf, scale(4.0 * math.pi, s), 0.25 / math.pi
-    q = column3(lights, k, 7)
-    pdf_area = 1.0
-    normal = (0.0, 0.0, 0.0)
+    q, normal, pdf_area = column3(lights, k, 7), column3(lights, k, 10), 1.0
     if kind == QUAD:
         u, v = uniform(rng), uniform(rng)
         eu, ev = column3(lights, k, 10), column3(lights, k, 13)
@@ -154,33 +164,41 @@ def sample_light(lights, k, p, rng):
     cosine = -dot(wi, normal) * pdf_area
     if cosine <= 0.0:
         return wi, r, (0.0, 0.0, 0.0), 1.0
+    if kind == SPOT:
+        return wi, r, scale(cosine / r2, colour), 0.0
     pdf = pdf_area * r2 / cosine
     return wi, r, scale(1.0 / pdf, colour), pdf
 
 
 @jit
-def hit_quad(lights, ray, t_max):
-    """(t, k) of the nearest quad light that faces the ray before t_max, k = -1 if there is none."""
+def hit_quad(quads, ray, t_max):
+    """(t, k) of the nearest quad light that a ray runs into before t_max, k = -1 if there is none."""
     best, which = t_max, -1
-    for k in range(lights.shape[0]):
-        if lights[k, 0] == QUAD:
-            eu, ev = column3(lights, k, 10), column3(lights, k, 13)
-            n = cross(eu, ev)
-            facing = dot(ray[1], n)
-            if facing < 0.0:
-                corner = column3(lights, k, 7)
-                t = dot(sub(corner, ray[0]), n) / facing
-                if 1e-9 < t < best:
-                    q = sub(along(ray, t), corner)
-                    n2 = dot(n, n)
-                    u, v = dot(cross(q, ev), n) / n2, dot(cross(eu, q), n) / n2
-                    if 0.0 <= u <= 1.0 and 0.0 <= v <= 1.0:
-                        best, which = t, k
+    for k in range(quads.shape[0]):
+        eu, ev = column3(quads, k, 10), column3(quads, k, 13)
+        n = cross(eu, ev)
+        facing = dot(ray[1], n)
+        if facing < 0.0 or (facing > 0.0 and quads[k, 1] > 0.0):
+            corner = column3(quads, k, 7)
+            t = dot(sub(corner, ray[0]), n) / facing
+            if RELATIVE * (extent(ray[0]) + extent(corner) + extent(eu) + extent(ev)) < t < best:
+                q = sub(along(ray, t), corner)
+                n2 = dot(n, n)
+                u, v = dot(cross(q, ev), n) / n2, dot(cross(eu, q), n) / n2
+                if 0.0 <= u <= 1.0 and 0.0 <= v <= 1.0:
+                    best, which = t, k
     return best, which
 
 
 @jit
-def quad_pdf(lights, k, ray, t):
-    """Solid-angle density with which ``sample_light`` would have chosen the ray that meets quad k at t."""
-    n = cross(column3(lights, k, 10), column3(lights, k, 13))
-    return t * t / max(-dot(ray[1], n), 1e-30)
+def quad_radiance(quads, k, d):
+    """What a ray along d that ends on quad k sees: its radiance, or black from behind."""
+    n = cross(column3(quads, k, 10), column3(quads, k, 13))
+    return column3(quads, k, 4) if dot(d, n) < 0.0 else (0.0, 0.0, 0.0)
+
+
+@jit
+def quad_pdf(quads, k, ray, t):
+    """Solid-angle density with which ``sample_light`` would have chosen the ray that meets quad k at t in front."""
+    n = cross(column3(quads, k, 10), column3(quads, k, 13))
+    return t * t / abs(dot(ray[1], n))

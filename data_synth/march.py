@@ -1,11 +1,14 @@
 """The simple volume integrator: ray-marched single scattering (PHYSICS 7, 9), and the cloud preview (PHYSICS 13).
 
-Along a ray through the medium, per step with optical thickness dtau at its midpoint x,
+Along a ray through a medium, per step with optical thickness dtau at its midpoint x,
     L += T (1 - e^-dtau) J(x),   T *= e^-dtau,
     J  = (1 - albedo) Le + albedo sum_lights f_p(wo, wi) L_i(x) T_light(x),
-up to the next surface, which adds T times its directly lit radiance. Lights are beams (points and directions). T_light
-comes from marching to the light, from a deep shadow map, or from the preview's guess; or all of J has been gathered at
-the samples of the density (``gather.py``).
+up to the next surface, which adds T times its directly lit radiance. Lights are beams (points, spots and directions).
+T_light comes from marching to the light, from a deep shadow map, or from the preview's guess; or all of J has been
+gathered at the samples of the density (``gather.py``).
+
+Glass refracts the ray. Where light enters it, the part F that is mirrored shows the sky and 1 - F goes on; where it leaves
+it all of it goes on unless none can. Alpha and distance belong to the straight ray, which ends there.
 """
 
 import math
@@ -15,19 +18,22 @@ import numpy as np
 
 from data_synth import materials, phase
 from data_synth.cameras import pixel_ray
-from data_synth.gather import OPAQUE, march_gathered
+from data_synth.gather import OPAQUE, Clear, march_gathered
 from data_synth.jit import jit, kernel
-from data_synth.lights import escaped, sample_light
+from data_synth.lights import escaped, quad_radiance, sample_light
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE
 from data_synth.media import attribute, box_interval, extinction, lookup
 from data_synth.rng import reseed
 from data_synth.shadowmap import ShadowMaps, look_up
 from data_synth.spongecake import attenuation
 from data_synth.traverse import steps, traversal
-from data_synth.vec import add, along, dot, largest, mul, neg, scale, sub
-from data_synth.world import blocked, inside_medium, next_surface, visible
+from data_synth.vec import add, along, dot, largest, mean, mul, neg, scale, sub
+from data_synth.world import (
+    MARCHED, SURFACES, crossing, index_at, inside_at, medium_of, next_surface, number_at, visible,
+)  # fmt: skip
 
-MARCHED, MAPPED, PREVIEW, UNLIT, GATHERED = range(5)
+BY_RAYS, MAPPED, PREVIEW, UNLIT, GATHERED = range(5)
+NEAR = 1.0 - 1e-9  # of the distance to a light, so that a lamp is not in the way of its own light
 
 
 class Lighting(NamedTuple):
@@ -38,21 +44,30 @@ class Lighting(NamedTuple):
     rho_J: np.ndarray
 
 
-@jit
-def light_at(w, maps, mode, k, p, wi, distance, inside, rng):
-    """T_light: RGB transmittance from p inside the medium to light k."""
-    if mode == MAPPED:
-        return look_up(maps, w, k, p, rng)
-    return visible(w, (p, wi), distance, inside, False, rng)
+class Seen(NamedTuple):
+    """What a ray has met so far: radiance, transmittance, and the sum of weight times distance."""
+
+    L: tuple[float, float, float]
+    T: tuple[float, float, float]
+    far: float
+
+
+class Step(NamedTuple):
+    """What a marching step reads. number: of the medium; inside: as in ``world.py``; base: distance of the ray's origin."""
+
+    lighting: Lighting
+    number: int
+    inside: int
+    base: float
 
 
 @jit
-def preview_source(w, p, wi, wo, a, rng):
-    """[Horizon] an approximation, not a solution: energy = 2 e^-d f_HG powder, powder = 1 - e^-2d, and a soft floor.
+def preview_source(m, p, wi, wo, a, rng):
+    """[Horizon] an approximation, not a solution: energy = 2 e^-d f_HG powder, powder = 1 - e^-2d, with floors to both:
+    e^-d is at least 0.7 e^(-d/4), and powder 1 - e^(-2d - 1/2), so that a cloud's rim and depth do not go black.
 
     d is the optical depth of six samples towards the sun, spread over a third of the medium's height.
     """
-    m = w.medium
     reach = (m.hi[2] - m.lo[2]) / 3.0
     d, t = 0.0, 0.0
     for k in range(6):
@@ -68,139 +83,148 @@ def preview_source(w, p, wi, wo, a, rng):
 
 
 @jit
+def scattered_light(w, m, p, wo, a, step, rng):
+    """sum over lights of f_p L_i T_light at a point of medium m."""
+    total, mode = (0.0, 0.0, 0.0), step.lighting.mode
+    for k in range(w.lights.shape[0]):
+        wi, distance, radiance, _ = sample_light(w.lights, k, p, rng)
+        if largest(radiance) <= 0.0:
+            continue
+        if mode == PREVIEW:
+            total = add(total, scale(preview_source(m, p, wi, wo, a, rng), radiance))
+            continue
+        if mode == MAPPED and step.number == 0:
+            shadow = look_up(step.lighting.maps, w, k, p, rng)
+        else:
+            shadow = visible(w, (p, wi), distance * NEAR, step.inside, MARCHED, rng)
+        if largest(shadow) > 0.0:
+            total = add(total, mul(scale(phase.evaluate(m.phase, a, wo, wi, rng), radiance), shadow))
+    return total
+
+
+@jit
 def scatter_event(m, ray, t, width, state, context):
-    """One marching step; state = (L rgb, T rgb, sum of weight times distance)."""
-    w, maps, mode, inside, base, rng = context
+    """One marching step."""
+    w, step, rng = context
     p, wo = along(ray, t), neg(ray[1])
     rho = extinction(m, p, ray[1])
     if rho <= 0.0:
         return state, False
-    L, T = (state[0], state[1], state[2]), (state[3], state[4], state[5])
     a = attribute(m, p)
     albedo, Le = lookup(m.albedo, a), lookup(m.Le, a)
     scattered = (0.0, 0.0, 0.0)
-    if mode != UNLIT and largest(albedo) > 0.0:
-        for k in range(w.lights.shape[0]):
-            wi, distance, radiance, _ = sample_light(w.lights, k, p, rng)
-            if mode == PREVIEW:
-                scattered = add(scattered, scale(preview_source(w, p, wi, wo, a, rng), radiance))
-            else:
-                shadow = light_at(w, maps, mode, k, p, wi, distance, inside, rng)
-                if largest(shadow) > 0.0:
-                    f = phase.evaluate(m.phase, a, wo, wi, rng)
-                    scattered = add(scattered, mul(scale(f, radiance), shadow))
+    if step.lighting.mode != UNLIT and largest(albedo) > 0.0:
+        scattered = scattered_light(w, m, p, wo, a, step, rng)
     J = add(mul(sub((1.0, 1.0, 1.0), albedo), Le), mul(albedo, scattered))
     s = scale(-rho * width, m.sigma_t)
-    weight = mul(T, (-math.expm1(s[0]), -math.expm1(s[1]), -math.expm1(s[2])))
-    L, T = add(L, mul(weight, J)), sub(T, weight)
-    far = state[6] + (weight[0] + weight[1] + weight[2]) / 3.0 * (base + t)
-    return (L[0], L[1], L[2], T[0], T[1], T[2], far), largest(T) < OPAQUE
+    weight = mul(state.T, (-math.expm1(s[0]), -math.expm1(s[1]), -math.expm1(s[2])))
+    T = sub(state.T, weight)
+    return Seen(add(state.L, mul(weight, J)), T, state.far + mean(weight) * (step.base + t)), largest(T) < OPAQUE
 
 
 march_medium = traversal(steps(scatter_event))
 
 
 @jit
-def lit_surface(w, maps, mode, p, n, material, wo, inside, rng):
-    """Radiance towards wo from a surface point that all lights reach straight, through the medium."""
+def lit_surface(w, lighting, p, n, material, wo, inside, rng):
+    """Radiance towards wo from a surface point that all lights reach straight, through the media."""
     m, total = w.medium, (0.0, 0.0, 0.0)
     for k in range(w.lights.shape[0]):
         wi, distance, radiance, _ = sample_light(w.lights, k, p, rng)
-        f = materials.evaluate(w.materials, material, p, n, wo, wi)
+        f = mul(materials.evaluate(w.materials, material, p, n, wo, wi), radiance)
         if largest(f) <= 0.0:
             continue
         t0, t1 = box_interval((p, wi), m.lo, m.hi)
-        mapped = mode == MAPPED or mode == GATHERED
-        if mapped and 0.0 < t0 and not w.bounded:  # the point lies outside the medium: look up where it enters
-            shadow = (1.0, 1.0, 1.0)
-            if blocked(w, (p, wi), distance):
-                shadow = (0.0, 0.0, 0.0)
-            elif t0 < min(t1, distance):
-                shadow = look_up(maps, w, k, along((p, wi), t0), rng)
+        mapped = lighting.mode == MAPPED or lighting.mode == GATHERED
+        if mapped and t0 > 0.0 and inside == 0 and w.ambient == 0:  # outside the box: look up where the light enters
+            shadow = visible(w, (p, wi), distance * NEAR, inside, SURFACES, rng)
+            if t0 < min(t1, distance):
+                shadow = mul(shadow, look_up(lighting.maps, w, k, along((p, wi), t0), rng))
         else:
-            # leaving through the other side of a boundary surface changes the medium
-            shadow = visible(w, (p, wi), distance, inside, False, rng)
-        total = add(total, mul(mul(f, radiance), shadow))
+            shadow = visible(w, (p, wi), distance * NEAR, inside, MARCHED, rng)
+        total = add(total, mul(f, shadow))
     return total
 
 
 @jit
-def march_ray(w, lighting, ray, inside, rng):
-    """(L rgb, T rgb, distance sum) of a ray up to its end, single scattering only."""
-    state, base = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0), 0.0
-    mode, maps = lighting.mode, lighting.maps
-    for _ in range(64):
-        t, n, material, quad = next_surface(w, ray)
-        if inside:
-            t0, t1 = box_interval(ray, w.medium.lo, w.medium.hi)
-            if mode == GATHERED:  # a grey medium, behind grey surfaces at most
-                s = (state[0], state[1], state[2], state[3], state[6])
-                s = march_gathered(w.medium, lighting.rho_J, ray, t0, min(t, t1), base, s)
-                state = (s[0], s[1], s[2], s[3], s[3], s[3], s[4])
-            else:
-                context = (w, maps, mode, inside, base, rng)
-                state, _ = march_medium(w.medium, ray, t0, min(t, t1), True, state, context)
-            if max(state[3], state[4], state[5]) < OPAQUE:
-                break
-        if material < 0:
-            break
-        L, T, far = (state[0], state[1], state[2]), (state[3], state[4], state[5]), state[6]
-        p, wo = along(ray, t), neg(ray[1])
-        kind = w.materials.rows[material, 0]
-        d = ray[1]
-        if kind == NULL:
-            inside = dot(d, n) < 0.0 if w.bounded else inside
-        elif kind == DIELECTRIC:
-            d, inside = bend(n, wo, w.materials.rows[material, 10], inside)
-            mode = MAPPED if mode == GATHERED else mode  # the eye is no longer where the ray comes from
-        else:
-            if mode != UNLIT:
-                L = add(L, mul(T, lit_surface(w, maps, mode, p, n, material, wo, inside, rng)))
-            row = w.materials.rows[material]
-            kept = 0.0
-            if kind == SPONGECAKE:
-                kept = attenuation(w.materials.layers, int(row[11]), int(row[12]), materials.to_local(n, wo))
-            far += (T[0] + T[1] + T[2]) / 3.0 * (1.0 - kept) * (base + t)
-            T = scale(kept, T)
-        state = (L[0], L[1], L[2], T[0], T[1], T[2], far)
-        if largest(T) < OPAQUE:
-            break
-        ray, base = (p, d), base + t
-    return state, ray[1]
+def enter_glass(w, material, n, wo, inside):
+    """(direction, ``inside`` behind, mirrored fraction, whether it was bent) at a dielectric boundary."""
+    behind = crossing(w.materials.rows[material], inside, dot(wo, n) > 0.0)
+    here, there = index_at(w, inside), index_at(w, behind)
+    if here == there:
+        return neg(wo), behind, 0.0, False
+    d, reflectance = materials.refracted(n, wo, here / there)
+    if reflectance >= 1.0:
+        return d, inside, 0.0, True
+    return d, behind, reflectance if there > here else 0.0, True
 
 
 @jit
-def bend(n, wo, ior, inside):
-    """(direction, inside) behind a clear boundary: refracted, or mirrored where nothing refracts."""
-    cosine = dot(n, wo)
-    eta = 1.0 / ior if cosine > 0.0 else ior
-    s2 = eta * eta * (1.0 - cosine * cosine)
-    if s2 >= 1.0:
-        return sub(scale(2.0 * cosine, n), wo), inside
-    side = 1.0 if cosine > 0.0 else -1.0
-    d = sub(scale(eta * abs(cosine) - math.sqrt(1.0 - s2), scale(side, n)), scale(eta, wo))
-    return scale(1.0 / math.sqrt(dot(d, d)), d), cosine > 0.0
+def march_ray(w, lighting, ray, inside, opaque_sky, rng):
+    """(L rgb, alpha, distance sum) of a ray up to its end, single scattering only."""
+    seen, base, straight, alpha = Seen((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.0), 0.0, True, 1.0
+    for _ in range(64):
+        t, n, material, quad = next_surface(w, ray)
+        number = number_at(w, inside)
+        if number >= 0:
+            m, far = medium_of(w, number), seen.far
+            t0, t1 = box_interval(ray, m.lo, m.hi)
+            if lighting.mode == GATHERED:  # a grey medium, behind grey surfaces at most
+                s = march_gathered(m, lighting.rho_J, ray, t0, min(t, t1), base, Clear(seen.L, seen.T[0], seen.far))
+                seen = Seen(s.L, (s.T, s.T, s.T), s.far)
+            else:
+                context = (w, Step(lighting, number, inside, base), rng)
+                seen, _ = march_medium(m, ray, t0, min(t, t1), True, seen, context)
+            if not straight:
+                seen = Seen(seen.L, seen.T, far)
+            if largest(seen.T) < OPAQUE:
+                break
+        if quad >= 0:
+            far = mean(seen.T) * (base + t) if straight else 0.0
+            L = add(seen.L, mul(seen.T, quad_radiance(w.quads, quad, ray[1])))
+            seen = Seen(L, (0.0, 0.0, 0.0), seen.far + far)
+        if material < 0:
+            break
+        p, wo, d = along(ray, t), neg(ray[1]), ray[1]
+        L, T, far = seen.L, seen.T, seen.far
+        row = w.materials.rows[material]
+        if row[0] == NULL:
+            inside = crossing(row, inside, dot(d, n) < 0.0)
+        elif row[0] == DIELECTRIC:
+            d, inside, reflectance, bent = enter_glass(w, material, n, wo, inside)
+            if bent:
+                far += mean(T) * (base + t) if straight else 0.0
+                L = add(L, mul(scale(reflectance, T), escaped(w.sky, materials.mirrored(n, wo))))
+                T, straight = scale(1.0 - reflectance, T), False
+        else:
+            if lighting.mode != UNLIT:
+                L = add(L, mul(T, lit_surface(w, lighting, p, n, material, wo, inside, rng)))
+            kept = 0.0
+            if row[0] == SPONGECAKE:
+                kept = attenuation(w.materials.layers, int(row[11]), int(row[12]), materials.to_local(n, wo))
+            far += (1.0 - kept) * mean(T) * (base + t) if straight else 0.0
+            T = scale(kept, T)
+        seen = Seen(L, T, far)
+        if largest(T) < OPAQUE:
+            break
+        ray, base = (p, d), base + t
+    if straight and not opaque_sky:
+        return seen.L, 1.0 - mean(seen.T), seen.far
+    return add(seen.L, mul(seen.T, escaped(w.sky, ray[1]))), alpha, seen.far
 
 
 @kernel
-def render_rows(w, backdrop, lighting, camera, side, opaque_sky, rng, out, first, last):
-    """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance; side x side rays per pixel on a regular grid.
-
-    backdrop: the light table whose sky is seen behind everything if opaque_sky.
-    """
+def render_rows(w, lighting, camera, side, opaque_sky, rng, out, first, last):
+    """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance; side x side rays per pixel on a regular grid."""
     o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
+    inside, share = inside_at(w, o), 1.0 / (side * side)
     for j in range(first, last):
         for i in range(out.shape[1]):
             reseed(rng, 1, j * out.shape[1] + i)
             r, g, b, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0
             for s in range(side * side):
                 ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
-                state, d = march_ray(w, lighting, ray, inside_medium(w, ray), rng)
-                T = (state[3], state[4], state[5])
-                seen = mul(T, escaped(backdrop, d)) if opaque_sky else (0.0, 0.0, 0.0)
-                r, g, b = r + state[0] + seen[0], g + state[1] + seen[1], b + state[2] + seen[2]
-                alpha += 1.0 if opaque_sky else 1.0 - (T[0] + T[1] + T[2]) / 3.0
-                far += state[6]
-            scale_by = 1.0 / (side * side)
-            out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * scale_by, g * scale_by, b * scale_by
-            out[j, i, 3], out[j, i, 4] = alpha * scale_by, far * scale_by
+                L, a, t = march_ray(w, lighting, ray, inside, opaque_sky, rng)
+                r, g, b, alpha, far = r + L[0], g + L[1], b + L[2], alpha + a, far + t
+            out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * share, g * share, b * share
+            out[j, i, 3], out[j, i, 4] = alpha * share, far * share

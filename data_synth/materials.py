@@ -1,7 +1,8 @@
 """What surfaces do to light (PHYSICS 9). A material table is a (n, 16) float array with rows made below.
 
 Columns: kind, albedo (1-3), second albedo of a checker (4-6), edge of its squares (7, 0 = none), gloss (8), exponent
-(9), index of refraction (10), first and last row in the layer table (11, 12).
+(9), index of refraction (10), first and last row in the layer table (11, 12), and of boundaries the number of the
+medium inside (13), the priority (14) and, in a world, the place of their counter (15, -1 = none; see ``world.py``).
 All directions point outward; n is the geometric normal, out of closed shapes.
 """
 
@@ -21,6 +22,7 @@ from data_synth.rng import uniform
 from data_synth.vec import add, cross, dot, from_frame, mul, neg, scale, sphere_direction, sub, unit
 
 LAMBERT, BLINN_PHONG, SPONGECAKE, DIELECTRIC, NULL = range(5)
+CLEAR, UNSAID = -1, -2  # no medium inside; the scene decides
 
 
 class Materials(NamedTuple):
@@ -44,18 +46,32 @@ def blinn_phong(
     return row
 
 
-def dielectric(ior: float) -> np.ndarray:
-    """A clear, smooth boundary: it reflects and refracts. ior inside over ior outside."""
+def dielectric(ior: float, medium: int | None = None, priority: float = 0.0) -> np.ndarray:
+    """A clear, smooth boundary: it reflects and refracts. ior: the index of refraction inside; outside of all it is 1.
+
+    medium: the number of the medium inside, ``CLEAR`` for none; None: as the scene says. priority: where closed
+    boundaries overlap the highest counts, of equal ones the later material (Schmidt & Budge 2002).
+    """
     if not ior > 0:
         raise InputError(f"dielectric: ior must be positive, got {ior}")
-    row = _row(DIELECTRIC, 1.0, None, 0.0)
+    row = _boundary(DIELECTRIC, medium, priority)
     row[10] = ior
     return row
 
 
-def null() -> np.ndarray:
-    """A boundary that only tells where the medium is: light passes."""
-    return _row(NULL, 1.0, None, 0.0)
+def null(medium: int | None = None, priority: float = 0.0) -> np.ndarray:
+    """A boundary that only tells where a medium is: light passes. medium, priority: as of ``dielectric``."""
+    return _boundary(NULL, medium, priority)
+
+
+def _boundary(kind: int, medium: int | None, priority: float) -> np.ndarray:
+    row = _row(kind, 1.0, None, 0.0)
+    if medium is not None and (medium != int(medium) or medium < CLEAR):
+        raise InputError(f"boundary: medium must be the number of a medium or {CLEAR} for none, got {medium}")
+    if not math.isfinite(priority):
+        raise InputError(f"boundary: priority must be finite, got {priority}")
+    row[13], row[14], row[15] = UNSAID if medium is None else medium, priority, -1
+    return row
 
 
 def layered(first: int, last: int) -> np.ndarray:
@@ -132,48 +148,46 @@ def pdf(m, k, n, wo, wi):
 
 
 @jit
-def refract(n, wo, ior, rng):
-    """Mirror or refract at a smooth boundary, by chance of the Fresnel reflectance. (wi, crossed)."""
+def mirrored(n, wo):
+    return sub(scale(2.0 * dot(n, wo), n), wo)
+
+
+@jit
+def refracted(n, wo, eta):
+    """(direction behind a smooth boundary, reflectance of unpolarised light). eta: index on the side of wo over the other.
+
+    Where nothing gets through the reflectance is 1.
+    """
     cosine = dot(n, wo)
-    eta = 1.0 / ior if cosine > 0.0 else ior
     s2 = eta * eta * (1.0 - cosine * cosine)
-    ci = abs(cosine)
-    fresnel = 1.0
-    if s2 < 1.0:
-        ct = math.sqrt(1.0 - s2)
-        parallel = (ci - eta * ct) / (ci + eta * ct)
-        across = (eta * ci - ct) / (eta * ci + ct)
-        fresnel = 0.5 * (parallel * parallel + across * across)
-    if uniform(rng) < fresnel:
-        return sub(scale(2.0 * cosine, n), wo), False
+    if s2 >= 1.0:
+        return mirrored(n, wo), 1.0
+    ci, ct = abs(cosine), math.sqrt(1.0 - s2)
+    parallel = (ci - eta * ct) / (ci + eta * ct)
+    across = (eta * ci - ct) / (eta * ci + ct)
     side = 1.0 if cosine > 0.0 else -1.0
-    return unit(sub(scale(eta * ci - math.sqrt(1.0 - s2), scale(side, n)), scale(eta, wo))), True
+    d = unit(sub(scale(eta * ci - ct, scale(side, n)), scale(eta, wo)))
+    return d, 0.5 * (parallel * parallel + across * across)
 
 
 @jit
 def sample(m, k, p, n, wo, rng):
-    """(wi, weight, pdf, crossed): weight = f |cos| / pdf; pdf 0 marks a delta; crossed: through a medium boundary.
+    """(wi, weight, pdf, straight): weight = f |cos| / pdf. straight: no flake of a layered sheet was met.
 
-    Radiance is not scaled by the squared index on refraction: it is scaled back when the path leaves again.
+    For surfaces that are no boundaries; those are crossed in ``world.py``.
     """
     row = m.rows[k]
-    one = (1.0, 1.0, 1.0)
-    if row[0] == NULL:
-        return neg(wo), one, 0.0, True
-    if row[0] == DIELECTRIC:
-        wi, crossed = refract(n, wo, row[10], rng)
-        return wi, one, 0.0, crossed
     if row[0] == SPONGECAKE:
         local, straight = spongecake.sample(m.layers, int(row[11]), int(row[12]), to_local(n, wo), rng)
         if straight:
-            return neg(wo), one, 0.0, False
+            return neg(wo), (1.0, 1.0, 1.0), 0.0, True
         s, t = spongecake_frame(n)
         wi = add(add(scale(local[0], s), scale(local[1], t)), scale(local[2], n))
     else:
         up = n if dot(n, wo) > 0.0 else neg(n)
         if row[0] == BLINN_PHONG and uniform(rng) < 0.5:
             h = sphere_direction(up, uniform(rng) ** (1.0 / (row[9] + 1.0)), 2.0 * math.pi * uniform(rng))
-            wi = unit(sub(scale(2.0 * dot(wo, h), h), wo))
+            wi = unit(mirrored(h, wo))
         else:
             r, a = math.sqrt(uniform(rng)), 2.0 * math.pi * uniform(rng)
             wi = from_frame(up, r * math.cos(a), r * math.sin(a), math.sqrt(max(1.0 - r * r, 0.0)))

@@ -23,6 +23,7 @@ from data_synth import phase as phases
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.sggx import projected_area
+from data_synth.vec import slab
 
 Point = Sequence[float] | np.ndarray
 BRICK = 8
@@ -259,12 +260,4 @@ def lookup(table, a):
 @jit
 def box_interval(ray, lo, hi):
     """(t0, t1) of a ray inside a box with t0 >= 0; t0 > t1 if it misses."""
-    t0, t1 = 0.0, math.inf
-    for axis in range(3):
-        if ray[1][axis] == 0.0:
-            if ray[0][axis] < lo[axis] or ray[0][axis] > hi[axis]:
-                return 1.0, 0.0
-        else:
-            a, b = (lo[axis] - ray[0][axis]) / ray[1][axis], (hi[axis] - ray[0][axis]) / ray[1][axis]
-            t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
-    return t0, t1
+    return slab(ray, lo, hi, 0.0, math.inf)

@@ -5,24 +5,32 @@ tracking (Kutz et al. 2017): at a tentative collision the path scatters with pro
 P_n = 1 - P_s, both in proportion to the path's mean throughput, and is reweighted by sigma_s / (sigma_maj P_s) or
 sigma_n / (sigma_maj P_n). Absorption is never drawn, it is a weight. In a grey medium of albedo 1 all weights are 1.
 At each vertex one light is sampled (next-event estimation, ratio-tracked shadow rays), combined with the direction the
-phase function or surface samples by the balance heuristic. Russian roulette ends weak paths.
+phase function or surface samples by the balance heuristic. Russian roulette ends weak paths, and before their shadow ray
+is walked those next events that would add little.
+
+Alpha and distance belong to the straight ray from the camera. It ends where it is scattered, absorbed, stopped by a
+surface or lamp, or bent by glass: the distance is the mean over these ends.
 """
 
 from typing import NamedTuple
 
-from data_synth import materials, phase
+from data_synth import equiangular, materials, phase
 from data_synth.cameras import pixel_ray
 from data_synth.jit import jit, kernel
-from data_synth.lights import column3, escaped, quad_pdf, sample_light
-from data_synth.materials import DIELECTRIC, NULL
+from data_synth.lights import POINT, column3, escaped, quad_pdf, quad_radiance, sample_light
+from data_synth.materials import DIELECTRIC
 from data_synth.media import attribute, box_interval, extinction, lookup
 from data_synth.rng import reseed, uniform
 from data_synth.traverse import collisions, traversal
-from data_synth.vec import add, along, dot, largest, mul, neg, scale, sub
-from data_synth.world import inside_medium, next_surface, visible
+from data_synth.vec import add, along, dot, largest, mean, mul, neg, scale, sub
+from data_synth.world import RANDOM, crossing, index_at, inside_at, medium_of, next_surface, number_at, visible
 
 ROULETTE_DEPTH = 6
-SEGMENTS = 100_000  # only a guard: roulette and max_depth end paths long before
+LONG = 1000  # scatterings after which even a path that loses nothing is ended by chance
+EVENT_ROULETTE = 0.1  # throughput times f (1/sr) below which next events are drawn by chance
+SEGMENTS = 1_000_000  # only a guard: roulette ends paths long before
+SKY_PDF = 0.07957747154594767  # 1 / 4 pi
+UNKNOWN = -1.0
 
 
 class Settings(NamedTuple):
@@ -35,143 +43,220 @@ class Settings(NamedTuple):
     seed: int
 
 
+class Flight(NamedTuple):
+    """What a path carries through a medium. base: distance of the ray's origin from the camera; far: sum of absorbed
+    weight times distance; t: where it scattered, -1 if nowhere."""
+
+    beta: tuple[float, float, float]
+    L: tuple[float, float, float]
+    base: float
+    far: float
+    t: float
+
+
+class Vertex(NamedTuple):
+    """Where light is looked for. material < 0: a point in medium ``number``, reached along ``ray`` in [t0, t1] of it."""
+
+    p: tuple[float, float, float]
+    wo: tuple[float, float, float]
+    n: tuple[float, float, float]
+    material: int
+    number: int
+    ray: tuple[tuple[float, float, float], tuple[float, float, float]]
+    t: float
+    t0: float
+    t1: float
+
+
 @jit
 def path_event(m, ray, t, width, state, rng):
-    """Tentative collision; state = (beta rgb, L rgb, t of the scattering). width = 1 / sigma_maj."""
-    beta, L = (state[0], state[1], state[2]), (state[3], state[4], state[5])
+    """Tentative collision. width = 1 / sigma_maj: every such point stands for 1 / sigma_maj of the ray, so that
+    sum beta (sigma_a / sigma_maj) Le estimates the integral of T sigma_a Le, and so does the distance of absorption."""
+    beta = state.beta
     p = along(ray, t)
     collide = scale(width * extinction(m, p, ray[1]), m.sigma_t)  # sigma_t / sigma_maj
     if largest(collide) <= 0.0:
         return state, False
     a = attribute(m, p)
-    albedo, Le = lookup(m.albedo, a), lookup(m.Le, a)
-    L = add(L, mul(beta, mul(mul(collide, sub((1.0, 1.0, 1.0), albedo)), Le)))
+    albedo = lookup(m.albedo, a)
+    absorbed = mul(beta, mul(collide, sub((1.0, 1.0, 1.0), albedo)))
+    L = add(state.L, mul(absorbed, lookup(m.Le, a)))
+    base, far = state.base, state.far + mean(absorbed) * (state.base + t)
     scatter = mul(beta, mul(collide, albedo))
     fly = mul(beta, sub((1.0, 1.0, 1.0), collide))
     s, n = scatter[0] + scatter[1] + scatter[2], fly[0] + fly[1] + fly[2]
     if s + n <= 0.0:
-        return (0.0, 0.0, 0.0, L[0], L[1], L[2], t), True
+        return Flight((0.0, 0.0, 0.0), L, base, far, t), True
     if uniform(rng) * (s + n) < s:
-        beta = scale((s + n) / s, scatter)
-        return (beta[0], beta[1], beta[2], L[0], L[1], L[2], t), True
-    beta = scale((s + n) / n, fly)
-    return (beta[0], beta[1], beta[2], L[0], L[1], L[2], -1.0), False
+        return Flight(scale((s + n) / s, scatter), L, base, far, t), True
+    return Flight(scale((s + n) / n, fly), L, base, far, -1.0), False
 
 
 fly_through = traversal(collisions(path_event))
 
 
 @jit
-def next_event(w, p, n, material, wo, inside, rng):
-    """Radiance towards wo at p from one light drawn at random, weighted against the other way to find it.
-
-    material < 0: p is in the medium, scattered by the phase function; else on a surface with normal n.
-    """
+def next_event(w, v, inside, beta, rng):
+    """beta times the radiance towards wo from one light drawn at random, weighted against the other ways to find it."""
     count = w.lights.shape[0]
     k = min(int(uniform(rng) * count), count - 1)
-    wi, distance, radiance, pdf = sample_light(w.lights, k, p, rng)
-    if material < 0:
-        a = attribute(w.medium, p)
-        value = phase.evaluate(w.medium.phase, a, wo, wi, rng)
+    wi, distance, radiance, pdf = sample_light(w.lights, k, v.p, rng)
+    mis = float(count)
+    if v.material < 0:
+        m = medium_of(w, v.number)
+        value = phase.evaluate(m.phase, attribute(m, v.p), v.wo, wi, rng)
         f = (value, value, value)
-        pdf_other = value if w.medium.phase.kind != phase.SGGX_DIFFUSE else 0.0
+        pdf_other = value if m.phase.kind != phase.SGGX_DIFFUSE else 0.0
+        if w.lights[k, 0] == POINT:
+            sigma = extinction(m, v.p, v.ray[1]) * largest(m.sigma_t)
+            placed = equiangular.density(v.ray, v.t0, v.t1, column3(w.lights, k, 7), v.t)
+            mis *= equiangular.share(sigma, placed, count, equiangular.point_lights(w.lights))
     else:
-        f = materials.evaluate(w.materials, material, p, n, wo, wi)
-        pdf_other = materials.pdf(w.materials, material, n, wo, wi)
-    contribution = mul(f, radiance)
+        f = materials.evaluate(w.materials, v.material, v.p, v.n, v.wo, wi)
+        pdf_other = materials.pdf(w.materials, v.material, v.n, v.wo, wi)
+    weight = mul(beta, f)
+    contribution = mul(weight, radiance)
     if largest(contribution) <= 0.0:
         return (0.0, 0.0, 0.0)
-    contribution = mul(contribution, visible(w, (p, wi), distance * (1.0 - 1e-9), inside, True, rng))
-    mis = pdf / (pdf + count * pdf_other) if pdf > 0.0 else 1.0
-    return scale(count * mis, contribution)
+    q = largest(weight) / EVENT_ROULETTE
+    if q < 1.0:
+        if uniform(rng) >= q:
+            return (0.0, 0.0, 0.0)
+        mis /= q
+    if pdf > 0.0:
+        mis *= pdf / (pdf + count * pdf_other)
+    return scale(mis, mul(contribution, visible(w, (v.p, wi), distance * (1.0 - 1e-9), inside, RANDOM, rng)))
 
 
 @jit
 def found_light(w, ray, t, quad, pdf_last):
     """Radiance of the sky or quad light that the sampled direction ran into, with the balance heuristic's weight.
 
+    t: distance of a quad from where the direction was sampled.
     pdf_last: density of that direction; 0 if next-event estimation could not have found the light (camera, mirrors);
-    negative if the density is not known, so that next-event estimation has the light to itself.
+    UNKNOWN if nobody knows the density, so that next-event estimation has the light to itself.
     """
     count = w.lights.shape[0]
-    if pdf_last < 0.0:
+    if pdf_last == UNKNOWN:
         return (0.0, 0.0, 0.0)
     if quad >= 0:
-        light, pdf = column3(w.lights, quad, 4), quad_pdf(w.lights, quad, ray, t)
+        light, pdf = quad_radiance(w.quads, quad, ray[1]), quad_pdf(w.quads, quad, ray, t)
     else:
-        light, pdf = escaped(w.lights, ray[1]), 0.07957747154594767
+        light, pdf = escaped(w.sky, ray[1]), SKY_PDF
     return scale(count * pdf_last / (count * pdf_last + pdf) if pdf_last > 0.0 else 1.0, light)
 
 
 @jit
-def trace_path(w, ray, settings, rng):
-    """One path: (L rgb, alpha, distance of its first event)."""
+def through_glass(w, material, n, wo, inside, rng):
+    """(direction, ``inside``, whether it was bent) behind a null or dielectric boundary, mirrored by chance."""
+    row = w.materials.rows[material]
+    behind = crossing(row, inside, dot(wo, n) > 0.0)
+    if row[0] != DIELECTRIC:
+        return neg(wo), behind, False
+    here, there = index_at(w, inside), index_at(w, behind)
+    if here == there:
+        return neg(wo), behind, False
+    wi, reflectance = materials.refracted(n, wo, here / there)
+    if uniform(rng) < reflectance:
+        return materials.mirrored(n, wo), inside, True
+    return wi, behind, True
+
+
+@jit
+def survival(beta, depth):
+    """Chance with which a path goes on after its depth-th scattering."""
+    if depth <= ROULETTE_DEPTH:
+        return 1.0
+    return min(largest(beta), 1.0 if depth < LONG else 0.99)
+
+
+@jit
+def scatter_direction(w, v, rng):
+    """(wi, weight, pdf, straight): a direction sampled by the phase function or surface at a vertex."""
+    if v.material >= 0:
+        return materials.sample(w.materials, v.material, v.p, v.n, v.wo, rng)
+    ph, a = medium_of(w, v.number).phase, attribute(medium_of(w, v.number), v.p)
+    wi = phase.sample(ph, a, v.wo, rng)
+    known = ph.kind != phase.SGGX_DIFFUSE
+    return wi, (1.0, 1.0, 1.0), phase.evaluate(ph, a, v.wo, wi, rng) if known else UNKNOWN, False
+
+
+@jit
+def trace_path(w, ray, inside, settings, rng):
+    """One path: (L rgb, alpha, distance at which its straight part ends, premultiplied by alpha)."""
     beta, L = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
-    inside, pdf_last, depth, base, far, alpha = inside_medium(w, ray), 0.0, 0, 0.0, -1.0, 1.0
-    lit = w.lights.shape[0] > 0
+    pdf_last, since, depth, base, far, alpha, straight = 0.0, 0.0, 0, 0.0, 0.0, 1.0, True
+    lit, points = w.lights.shape[0] > 0, equiangular.point_lights(w.lights) > 0
     for _ in range(SEGMENTS):
         t, n, material, quad = next_surface(w, ray)
-        scattered = False
-        if inside:
-            t0, t1 = box_interval(ray, w.medium.lo, w.medium.hi)
-            state = (beta[0], beta[1], beta[2], L[0], L[1], L[2], -1.0)
-            state, scattered = fly_through(w.medium, ray, t0, min(t, t1), True, state, rng)
-            beta, L = (state[0], state[1], state[2]), (state[3], state[4], state[5])
-            if scattered:
-                t, material, quad = state[6], -1, -1
+        scattered, t0, t1, number = False, 0.0, 0.0, number_at(w, inside)
+        if number >= 0:
+            m = medium_of(w, number)
+            t0, t1 = box_interval(ray, m.lo, m.hi)
+            t1 = min(t, t1)
+            if t1 > t0:
+                if points and depth < settings.max_depth:
+                    L = add(L, mul(beta, equiangular.in_segment(w, m, ray, t0, t1, inside, beta, rng)))
+                flight, scattered = fly_through(m, ray, t0, t1, True, Flight(beta, L, base, 0.0, -1.0), rng)
+                beta, L = flight.beta, flight.L
+                if straight:
+                    far += flight.far
+                if scattered:
+                    t, material, quad = flight.t, -1, -1
         if not scattered and (quad >= 0 or material < 0):
-            first = depth == 0 and quad < 0 and not settings.opaque_sky
-            if first:  # straight through: transparent
-                alpha = 1.0 - (beta[0] + beta[1] + beta[2]) / 3.0
-            elif lit:
-                L = add(L, mul(beta, found_light(w, ray, t, quad, pdf_last)))
+            if straight and quad < 0 and not settings.opaque_sky:  # straight through: transparent
+                alpha = 1.0 - mean(beta)
+            else:
+                L = add(L, mul(beta, found_light(w, ray, since + t, quad, pdf_last)))
+            if straight and quad >= 0:
+                far += mean(beta) * (base + t)
             break
         p, wo = along(ray, t), neg(ray[1])
-        kind = w.materials.rows[material, 0] if material >= 0 else -1.0
-        if far < 0.0 and kind < DIELECTRIC:
-            far = base + t
-        base += t
-        if kind >= DIELECTRIC:
-            wi, _, _, crossed = materials.sample(w.materials, material, p, n, wo, rng)
-            if crossed and w.bounded:
-                inside = dot(wi, n) < 0.0
-            pdf_last = pdf_last if kind == NULL else 0.0
+        base, since = base + t, since + t
+        if material >= 0 and w.materials.rows[material, 0] >= DIELECTRIC:
+            wi, inside, bent = through_glass(w, material, n, wo, inside, rng)
+            if bent:
+                if straight:
+                    far += mean(beta) * base
+                straight, pdf_last = False, 0.0
             ray = (p, wi)
             continue
-        if depth >= settings.max_depth or largest(beta) <= 0.0:
+        v = Vertex(p, wo, n, material, number, ray, t, t0, t1)
+        on = depth < settings.max_depth and largest(beta) > 0.0
+        if lit and on:
+            L = add(L, next_event(w, v, inside, beta, rng))
+        wi, weight, pdf, passed = scatter_direction(w, v, rng)
+        if passed:  # a sheet whose flakes were missed: as if it were not there
+            ray = (p, wi)
+            continue
+        if straight:
+            far += mean(beta) * base
+        straight, pdf_last, since = False, pdf, 0.0
+        if not on:
             break
-        if lit:
-            L = add(L, mul(beta, next_event(w, p, n, material, wo, inside, rng)))
-        if scattered:
-            a = attribute(w.medium, p)
-            wi = phase.sample(w.medium.phase, a, wo, rng)
-            known = w.medium.phase.kind != phase.SGGX_DIFFUSE
-            pdf_last = phase.evaluate(w.medium.phase, a, wo, wi, rng) if known else -1.0
-        else:
-            wi, weight, pdf_last, _ = materials.sample(w.materials, material, p, n, wo, rng)
-            beta = mul(beta, weight)
+        beta = mul(beta, weight)
         depth += 1
-        if depth > ROULETTE_DEPTH:
-            q = min(largest(beta), 0.98)
+        q = survival(beta, depth)
+        if q < 1.0:
             if uniform(rng) >= q:
                 break
             beta = scale(1.0 / q, beta)
         ray = (p, wi)
-    return L, alpha, max(far, 0.0)
+    return L, alpha, far
 
 
 @kernel
 def render_rows(w, camera, settings, rng, out, first, last):
     """Rows first..last - 1 of out (H, W, 8) = rgb, alpha, distance, variance of the mean rgb."""
     o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
-    n = settings.spp
+    n, inside = settings.spp, inside_at(w, o)
     for j in range(first, last):
         for i in range(out.shape[1]):
             reseed(rng, settings.seed, j * out.shape[1] + i)
             r, g, b, rr, gg, bb, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for _ in range(n):
                 x, y = (uniform(rng), uniform(rng)) if settings.jitter else (0.5, 0.5)
-                L, a, t = trace_path(w, (o, pixel_ray(camera, i + x, j + y)), settings, rng)
+                L, a, t = trace_path(w, (o, pixel_ray(camera, i + x, j + y)), inside, settings, rng)
                 r, g, b, alpha, far = r + L[0], g + L[1], b + L[2], alpha + a, far + t
                 rr, gg, bb = rr + L[0] * L[0], gg + L[1] * L[1], bb + L[2] * L[2]
             r, g, b = r / n, g / n, b / n

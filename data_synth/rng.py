@@ -6,7 +6,8 @@ is the same whatever the number of threads.
 
 import numpy as np
 
-from data_synth.jit import jit
+from data_synth.errors import InputError
+from data_synth.jit import jit, kernel
 
 
 @jit
@@ -24,10 +25,20 @@ def reseed(rng, seed, stream):
 
 
 def new_rng(seed: int, stream: int) -> np.ndarray:
-    """A stream to hand to a kernel."""
+    """A stream to hand to a kernel. Neither seeds nor streams are shifts of one another: both are scrambled.
+
+    InputError for a negative seed.
+    """
+    if seed < 0:
+        raise InputError(f"seed: expected a whole number from 0 on, got {seed}")
     rng = np.zeros(1, np.uint64)
-    rng[0] = np.uint64((seed * 0x9E3779B97F4A7C15 + stream * 0xBF58476D1CE4E5B9 + 0x94D049BB133111EB) % 2**64)
+    _start(rng, np.uint64(seed % 2**64), np.uint64(stream % 2**64))
     return rng
+
+
+@kernel
+def _start(rng, seed, stream):
+    reseed(rng, seed, stream)
 
 
 @jit

@@ -1,8 +1,10 @@
-"""A scene: one medium, surfaces, materials and lights."""
+"""A scene: media, surfaces, materials and lights."""
 
 from __future__ import annotations
 
+import hashlib
 import warnings
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,20 +19,24 @@ from data_synth.cameras import Camera, Viewpoints
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
 from data_synth.integrators import Integrator, Prepared, make
-from data_synth.world import World
+from data_synth.pool import pool
+from data_synth.world import COUNTERS, World
 
-NOTHING = media.homogeneous((-1e-3,) * 3, (1e-3,) * 3, sigma_t=0.0)
+NOTHING = media.homogeneous((0.0,) * 3, (1.0,) * 3, sigma_t=0.0)._replace(brick_max=np.zeros(1), max_density=0.0)
 
 
 @dataclass
 class Scene:
     """What can be rendered.
 
-    medium: a ``media`` medium or None. shapes, triangles: rows of ``surfaces`` whose material numbers index
-    ``materials``; layers: rows of ``spongecake.layer``. lights: rows of ``lights``.
-    If a shape's material is ``null`` or ``dielectric`` and ``bounded`` is True, the medium fills those closed shapes
-    and nothing else. opaque_sky: the picture shows the sky instead of being transparent there. integrators: by name,
-    the first is the scene's own choice. exposure scales the colours of 8-bit pictures.
+    medium: a ``media`` medium or None, number 0; media: further ones, numbers 1, 2, ... shapes, triangles: rows of
+    ``surfaces`` whose material numbers index ``materials``; layers: rows of ``spongecake.layer``. lights: rows of
+    ``lights``. bounded: whether the medium fills the closed shapes with a ``null`` or ``dielectric`` material and nothing
+    else; if not it fills its whole box, except for what is inside glass. A boundary material that names a medium itself
+    holds that one in both cases. opaque_sky: the picture shows the sky instead of being transparent there. integrators:
+    by name, the first is the scene's own choice. exposure scales the colours of 8-bit pictures.
+
+    All of it may be changed between two renders; what integrators keep is made again then.
     """
 
     name: str = "scene"
@@ -47,25 +53,66 @@ class Scene:
     integrators: tuple[str, ...] = ("deep", "march", "path")
     exposure: float = 1.0
     parameters: dict = field(default_factory=dict)
+    media: list = field(default_factory=list)
     prepared: dict[object, Prepared] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What integrators keep for the next view: arrays and shadow maps, which do not depend on the camera."""
 
     def world(self, beams: int = 0) -> World:
         """The arrays for kernels. beams > 0 replaces sky and quad lights by that many beams each."""
         rows = lamps.discretise(self.lights, beams) if beams else list(self.lights)
-        if not rows and (self.medium is None or not np.any(self.medium.Le)):
+        glows = any(np.any(m.Le) for m in (self.medium, *self.media) if m is not None)
+        if not rows and not glows:
             warnings.warn(f"scene {self.name} has no lights: the picture is black", RenderWarning, stacklevel=3)
         shapes = surfaces.geometry(self.shapes, self.triangles)
-        used = [int(k) for k in [*shapes.shapes[:, 1], *shapes.triangles[:, 0]]]
+        used = {int(k) for k in [*shapes.shapes[:, 1], *shapes.triangles[:, 0]]}
         if used and max(used) >= len(self.materials):
             raise InputError(f"scene {self.name}: material {max(used)} is used, {len(self.materials)} are defined")
+        own = _table(self.lights, lamps.WIDTH)
         return World(
             self.medium if self.medium is not None else NOTHING,
+            pool(self.media),
             shapes,
-            stuff.Materials(_table(self.materials, 16), _table(self.layers, 10)),
+            stuff.Materials(self._boundaries(used), _table(self.layers, 10)),
             _table(rows, lamps.WIDTH),
-            self.bounded,
+            own[own[:, 0] == lamps.QUAD],
+            own[own[:, 0] == lamps.SKY],
+            stuff.CLEAR if self.bounded or self.medium is None else 0,
         )
+
+    def _boundaries(self, used: set[int]) -> np.ndarray:
+        """The material table, with the media and counters of those boundaries that are used."""
+        rows = _table(self.materials, 16)
+        counters = 0
+        for k in sorted(used):
+            kind, medium = rows[k, 0], rows[k, 13]
+            if kind not in (stuff.DIELECTRIC, stuff.NULL):
+                continue
+            if medium == stuff.UNSAID:
+                if not self.bounded and kind == stuff.NULL:
+                    continue  # it tells nothing
+                rows[k, 13] = 0 if self.bounded and self.medium is not None else stuff.CLEAR
+            elif medium > len(self.media) or (medium == 0 and self.medium is None):
+                raise InputError(f"scene {self.name}: material {k} holds medium {medium:.0f}, which is not defined")
+            if counters == COUNTERS:
+                raise InputError(f"scene {self.name}: expected at most {COUNTERS} boundary materials, got more")
+            rows[k, 15], counters = counters, counters + 1
+        return rows
+
+    def fingerprint(self) -> bytes:
+        """A digest of all that a picture depends on but the camera: it tells whether the scene was changed."""
+        digest = hashlib.blake2b(repr((self.bounded, self.opaque_sky)).encode())
+        parts: list = [self.shapes, self.materials, self.layers, self.lights, self.triangles, self.medium, *self.media]
+        while parts:
+            part = parts.pop()
+            if isinstance(part, np.ndarray) and part.dtype != object:
+                digest.update(repr((part.shape, part.dtype.str)).encode())
+                digest.update(zlib.crc32(np.ascontiguousarray(part)).to_bytes(4, "little"))
+            elif isinstance(part, (tuple, list)):
+                digest.update(f"{len(part)} parts".encode())
+                parts += part
+            else:
+                digest.update(repr(part).encode())
+        return digest.digest()
 
     def render(self, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
         """One view, by default with the scene's own choice of integrator."""

@@ -21,7 +21,7 @@ from data_synth.jit import in_bands, jit, kernel
 from data_synth.lights import DIRECTIONAL, sample_light
 from data_synth.rng import new_rng
 from data_synth.vec import frame
-from data_synth.world import World, inside_medium, visible
+from data_synth.world import MARCHED, World, has_boundaries, inside_at, visible
 
 
 class ShadowMaps(NamedTuple):
@@ -66,7 +66,7 @@ def build(w: World, resolution: int, fill: str = "sweep") -> ShadowMaps:
     maps = ShadowMaps(to_grid, to_world, shape, np.concatenate([[0], np.cumsum(sizes)[:-1]]), values, channels)
     if fill != "lazy":
         for k in range(len(w.lights)):
-            swept = fill == "sweep" and w.lights[k, 0] == DIRECTIONAL and not w.bounded
+            swept = fill == "sweep" and w.lights[k, 0] == DIRECTIONAL and not has_boundaries(w)
             in_bands(lambda a, b, k=k, swept=swept: _fill(maps, w, k, swept, new_rng(0, 0), a, b), int(shape[k, 0]), 2)
     return maps
 
@@ -107,7 +107,7 @@ def towards_light(maps, w, k, i, j, h, rng):
     """Transmittance from sample (i, j, h) of map k all the way to its light."""
     p = apply(maps.to_world[k], (float(i), float(j), float(h)))
     wi, r, _, _ = sample_light(w.lights, k, p, rng)
-    return visible(w, (p, wi), r, inside_medium(w, (p, wi)), False, rng)
+    return visible(w, (p, wi), r * (1.0 - 1e-9), inside_at(w, p), MARCHED, rng)
 
 
 @kernel
@@ -122,7 +122,7 @@ def _fill(maps, w, k, swept, rng, first, last):
                 h = n[2] - 1 - back
                 if swept and back > 0:
                     p = apply(a, (float(i), float(j), float(h)))
-                    step = visible(w, (p, lamps.column3(w.lights, k, 7)), cell, True, False, rng)
+                    step = visible(w, (p, lamps.column3(w.lights, k, 7)), cell, 0, MARCHED, rng)
                     through = (through[0] * step[0], through[1] * step[1], through[2] * step[2])
                 else:
                     through = towards_light(maps, w, k, i, j, h, rng)

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
 from data_synth.jit import jit
-from data_synth.vec import along, cross, dot, sub, unit
+from data_synth.vec import along, cross, dot, extent, slab, sub, unit
 
 PLANE, SPHERE, BOX = range(3)
-EPSILON = 1e-6  # hits nearer than this (in u) are the surface a ray starts on
+RELATIVE = 1e-9  # hits nearer than this times the size of what takes part are the surface a ray starts on
 LEAF = 4
 
 
@@ -113,33 +113,36 @@ def sphere_roots(ray, centre, radius):
 
 
 @jit
-def box_roots(ray, lo, hi):
-    """(t0, t1) of a ray and a box, t0 > t1 if it misses; t0 may be negative."""
-    t0, t1 = -math.inf, math.inf
-    for axis in range(3):
-        inverse = 1.0 / ray[1][axis]
-        a, b = (lo[axis] - ray[0][axis]) * inverse, (hi[axis] - ray[0][axis]) * inverse
-        t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
-    return t0, t1
+def hit_shape(row, ray, t_max):
+    """Nearest t in (0, t_max) of a shape, t_max if there is none. 0 is as wide as rounding makes it (RELATIVE)."""
+    p, q = (row[2], row[3], row[4]), (row[5], row[6], row[7])
+    if row[0] == PLANE:
+        size, facing = extent(p), dot(ray[1], q)
+        t0 = dot(sub(p, ray[0]), q) / facing if facing != 0.0 else -1.0
+        t1 = t0
+    elif row[0] == SPHERE:
+        size = extent(p) + row[5]
+        t0, t1 = sphere_roots(ray, p, row[5])
+    else:
+        size = max(extent(p), extent(q))
+        t0, t1 = slab(ray, p, q, -math.inf, math.inf)
+    if t0 > t1:
+        return t_max
+    near = RELATIVE * (extent(ray[0]) + size)
+    t = t0 if t0 > near else t1
+    return t if near < t < t_max else t_max
 
 
 @jit
-def hit_shape(row, ray, t_max):
-    """Nearest t in (EPSILON, t_max) of a shape, t_max if there is none."""
-    p = (row[2], row[3], row[4])
+def contains(row, p):
+    """Whether a closed shape holds a point; of a plane it is the side that its normal does not point to."""
+    a, b = (row[2], row[3], row[4]), (row[5], row[6], row[7])
     if row[0] == PLANE:
-        n = (row[5], row[6], row[7])
-        facing = dot(ray[1], n)
-        t0 = dot(sub(p, ray[0]), n) / facing if facing != 0.0 else -1.0
-        t1 = t0
-    elif row[0] == SPHERE:
-        t0, t1 = sphere_roots(ray, p, row[5])
-    else:
-        t0, t1 = box_roots(ray, p, (row[5], row[6], row[7]))
-    if t0 > t1:
-        return t_max
-    t = t0 if t0 > EPSILON else t1
-    return t if EPSILON < t < t_max else t_max
+        return dot(sub(p, a), b) < 0.0
+    if row[0] == SPHERE:
+        to = sub(p, a)
+        return dot(to, to) < row[5] * row[5]
+    return a[0] < p[0] < b[0] and a[1] < p[1] < b[1] and a[2] < p[2] < b[2]
 
 
 @jit
@@ -161,19 +164,20 @@ def shape_normal(row, p):
 @jit
 def hit_triangle(row, ray, t_max):
     """Moller & Trumbore 1997; both sides."""
-    eu, ev = (row[4], row[5], row[6]), (row[7], row[8], row[9])
+    corner, eu, ev = (row[1], row[2], row[3]), (row[4], row[5], row[6]), (row[7], row[8], row[9])
     h = cross(ray[1], ev)
     det = dot(eu, h)
     if det == 0.0:
         return t_max
-    s = sub(ray[0], (row[1], row[2], row[3]))
+    s = sub(ray[0], corner)
     u = dot(s, h) / det
     if u < 0.0 or u > 1.0:
         return t_max
     q = cross(s, eu)
     v = dot(ray[1], q) / det
     t = dot(ev, q) / det
-    return t if v >= 0.0 and u + v <= 1.0 and EPSILON < t < t_max else t_max
+    near = RELATIVE * (extent(ray[0]) + extent(corner) + extent(eu) + extent(ev))
+    return t if v >= 0.0 and u + v <= 1.0 and near < t < t_max else t_max
 
 
 @jit
@@ -202,8 +206,8 @@ def hit_mesh(g, ray, t_max):
     index, best, which = 0, t_max, -1
     while index < g.bvh.shape[0]:
         node = g.bvh[index]
-        t0, t1 = box_roots(ray, (node[0], node[1], node[2]), (node[3], node[4], node[5]))
-        if t0 > t1 or t1 < 0.0 or t0 > best:
+        t0, t1 = slab(ray, (node[0], node[1], node[2]), (node[3], node[4], node[5]), 0.0, best)
+        if t0 > t1:
             index = int(node[8])
             continue
         for k in range(int(node[6]), int(node[6] + node[7])):

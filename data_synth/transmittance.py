@@ -23,9 +23,10 @@ from data_synth.jit import jit, kernel
 from data_synth.media import EXPONENTIAL, GRID, HOMOGENEOUS, Medium, Point, box_interval, extinction, triple
 from data_synth.rng import new_rng, uniform
 from data_synth.traverse import cells, chord_thickness, collisions, steps, traversal
-from data_synth.vec import along, exp_neg, largest, scale
+from data_synth.vec import along, exp_neg, largest, mul, scale, sub
 
 CLOSED, REGULAR, MARCH, DELTA, RATIO, RESIDUAL = range(6)
+SHADOW_ROULETTE = 0.2
 METHODS = {"closed": CLOSED, "regular": REGULAR, "march": MARCH, "delta": DELTA, "ratio": RATIO, "residual": RESIDUAL}
 DISTANCE_METHODS = {"closed": CLOSED, "regular": REGULAR, "march": MARCH, "woodcock": DELTA}
 
@@ -55,11 +56,25 @@ def delta_event(m, ray, t, width, state, rng):
 def ratio_event(m, ray, t, width, state, rng):
     """T *= chance of a null collision; state[3] is the control density that is accounted for elsewhere."""
     s = scale(width * (extinction(m, along(ray, t), ray[1]) - state[3]), m.sigma_t)
-    return (state[0] * (1.0 - s[0]), state[1] * (1.0 - s[1]), state[2] * (1.0 - s[2]), state[3]), False
+    T = mul((state[0], state[1], state[2]), sub((1.0, 1.0, 1.0), s))
+    return (T[0], T[1], T[2], state[3]), largest(T) <= 0.0
 
 
 @jit
-def residual_collisions(m, ray, a, b, brick, state, rng):
+def shadow_event(m, ray, t, width, state, rng):
+    """Ratio tracking of a shadow ray, which Russian roulette ends below T = 0.2: such a ray is hardly worth its way."""
+    state, stop = ratio_event(m, ray, t, width, state, rng)
+    T = max(state[0], state[1], state[2])
+    if stop or T >= SHADOW_ROULETTE:
+        return state, stop
+    if uniform(rng) * SHADOW_ROULETTE >= T:
+        return (0.0, 0.0, 0.0, 0.0), True
+    q = SHADOW_ROULETTE / T
+    return (q * state[0], q * state[1], q * state[2], state[3]), False
+
+
+@jit
+def residual_collisions(m, ray, a, b, brick, carry, state, rng):
     """The smallest extinction of the brick is attenuation in closed form, only the rest is left to collisions."""
     if brick < 0:
         low, high = 0.0, m.max_density
@@ -70,20 +85,27 @@ def residual_collisions(m, ray, a, b, brick, state, rng):
     control = exp_neg(scale(low * (b - a), m.sigma_t))
     state = (state[0] * control[0], state[1] * control[1], state[2] * control[2], low)
     sigma_maj = (high * m.flake_area - low) * largest(m.sigma_t)
-    if sigma_maj <= 1e-12 * largest(m.sigma_t):
-        return state, False
+    if sigma_maj <= 0.0:
+        return carry, state, False
+    if carry < 0.0:
+        carry = -math.log(1.0 - uniform(rng))
     t = a
     while True:
-        t -= math.log(1.0 - uniform(rng)) / sigma_maj
-        if t >= b:
-            return state, False
-        state, _ = ratio_event(m, ray, t, 1.0 / sigma_maj, state, rng)
+        room = (b - t) * sigma_maj
+        if carry >= room:
+            return carry - room, state, False
+        t += carry / sigma_maj
+        state, stop = ratio_event(m, ray, t, 1.0 / sigma_maj, state, rng)
+        if stop:
+            return -1.0, state, True
+        carry = -math.log(1.0 - uniform(rng))
 
 
 regular_thickness = traversal(cells(regular_event))
 march_thickness = traversal(steps(march_event))
 delta_tracking = traversal(collisions(delta_event))
 ratio_tracking = traversal(collisions(ratio_event))
+shadow_tracking = traversal(collisions(shadow_event))
 residual_tracking = traversal(residual_collisions)
 
 
@@ -108,7 +130,7 @@ def transmittance(m, ray, t0, t1, method, local, rng):
 
 @jit
 def shadow_transmittance(m, ray, t_max, random, rng):
-    """What shadow rays use: the closed form where there is one, else ratio tracking or marching."""
+    """What shadow rays use: the closed form where there is one, else ratio tracking with roulette, or marching."""
     t0, t1 = box_interval(ray, m.lo, m.hi)
     t1 = min(t1, t_max)
     if t1 <= t0:
@@ -116,7 +138,7 @@ def shadow_transmittance(m, ray, t_max, random, rng):
     if m.kind != GRID and m.flake_area == 1.0:
         return exp_neg(scale(chord_thickness(m, ray, 0.5 * (t0 + t1), t1 - t0), m.sigma_t))
     if random:
-        s, _ = ratio_tracking(m, ray, t0, t1, True, (1.0, 1.0, 1.0, 0.0), rng)
+        s, _ = shadow_tracking(m, ray, t0, t1, True, (1.0, 1.0, 1.0, 0.0), rng)
         return (s[0], s[1], s[2])
     return exp_neg(scale(march_thickness(m, ray, t0, t1, True, 0.0, rng)[0], m.sigma_t))
 

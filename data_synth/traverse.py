@@ -7,7 +7,8 @@ ones. A *stepper* walks one such piece with known density bounds and calls an *e
     collisions(event)  tentative collisions of a majorant (Woodcock 1965)   width = 1 / majorant
 An event is ``event(m, ray, t, width, state, context) -> (state, stop)``, with the state a number or tuple that it
 folds over and the context anything it reads: the random stream for ``collisions``. In all of them sigma_t width is the
-optical thickness (or chance of a real collision) that the point stands for.
+optical thickness (or chance of a real collision) that the point stands for. ``carry`` is what a stepper keeps from one
+piece to the next, -1 at first: for ``collisions`` the optical thickness that is left to the next tentative collision.
 Composing functions at import, as in ``traversal(cells(event))``, lets the compiler inline everything.
 """
 
@@ -39,12 +40,12 @@ def traversal(stepper: Callable) -> Callable:
         tx, di = first_crossing(o[0] - m.lo[0], d[0], i, sx)
         ty, dj = first_crossing(o[1] - m.lo[1], d[1], j, sy)
         tz, dk = first_crossing(o[2] - m.lo[2], d[2], k, sz)
-        a = t0
+        a, carry = t0, -1.0
         while True:
             b = min(tx, ty, tz, t1) if local else t1
             index = (i * ny + j) * nz + k if local else -1
             if b > a and (not local or m.brick_max[index] > 0.0):
-                state, stop = stepper(m, ray, a, b, index, state, context)
+                carry, state, stop = stepper(m, ray, a, b, index, carry, state, context)
                 if stop:
                     return state, True
             if b >= t1:
@@ -79,14 +80,14 @@ def steps(event: Callable) -> Callable:
     """Midpoints of the fewest equal steps that are not longer than m.step."""
 
     @jit
-    def stepper(m, ray, a, b, brick, state, context):
+    def stepper(m, ray, a, b, brick, carry, state, context):
         n = max(int(math.ceil((b - a) / m.step - 1e-9)), 1)
         width = (b - a) / n
         for k in range(n):
             state, stop = event(m, ray, a + (k + 0.5) * width, width, state, context)
             if stop:
-                return state, True
-        return state, False
+                return carry, state, True
+        return carry, state, False
 
     return stepper
 
@@ -95,7 +96,7 @@ def cells(event: Callable) -> Callable:
     """Each cell's chord; the event gets the chord's midpoint. Media without a grid are one cell per brick."""
 
     @jit
-    def stepper(m, ray, a, b, brick, state, context):
+    def stepper(m, ray, a, b, brick, carry, state, context):
         o, d = ray
         while a < b:
             end = b
@@ -109,30 +110,37 @@ def cells(event: Callable) -> Callable:
                 end = b
             state, stop = event(m, ray, 0.5 * (a + end), end - a, state, context)
             if stop:
-                return state, True
+                return carry, state, True
             a = end
-        return state, False
+        return carry, state, False
 
     return stepper
 
 
 def collisions(event: Callable) -> Callable:
-    """Tentative collisions at the rate of the majorant: the largest extinction of the brick in any colour."""
+    """Tentative collisions at the rate of the majorant: the largest extinction of the brick in any colour.
+
+    One exponential serves all the bricks up to a collision: what a brick leaves of it is carried into the next.
+    """
 
     @jit
-    def stepper(m, ray, a, b, brick, state, rng):
+    def stepper(m, ray, a, b, brick, carry, state, rng):
         rho = m.max_density if brick < 0 else m.brick_max[brick]
         sigma_maj = rho * m.flake_area * largest(m.sigma_t)
         if sigma_maj <= 0.0:
-            return state, False
+            return carry, state, False
+        if carry < 0.0:
+            carry = -math.log(1.0 - uniform(rng))
         t = a
         while True:
-            t -= math.log(1.0 - uniform(rng)) / sigma_maj
-            if t >= b:
-                return state, False
+            room = (b - t) * sigma_maj
+            if carry >= room:
+                return carry - room, state, False
+            t += carry / sigma_maj
             state, stop = event(m, ray, t, 1.0 / sigma_maj, state, rng)
             if stop:
-                return state, True
+                return -1.0, state, True
+            carry = -math.log(1.0 - uniform(rng))
 
     return stepper
 

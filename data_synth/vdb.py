@@ -1,7 +1,7 @@
-"""Reading and writing OpenVDB files with one float tree (Museth 2013; the layout follows OpenVDB's io, version 222+).
+"""Reading and writing OpenVDB files with float trees (Museth 2013; the layout follows OpenVDB's io, version 222+).
 
-Covers what density volumes need: ``Tree_float_5_4_3`` grids, stored as float or half, uncompressed or zip, with or
-without active-mask compression, under a scale and translation. Blosc is named and refused. Nothing is executed and all
+Covers what density volumes need: ``Tree_float_5_4_3`` grids, stored as float or half, uncompressed, zip or blosc, with or
+without active-mask compression, under a scale and translation. Nothing is executed and all
 sizes are checked against the file, so a truncated or hostile file is an ``InputError``.
 """
 
@@ -11,13 +11,14 @@ import os
 import struct
 import uuid
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth.blosc import decompress
 from data_synth.errors import InputError
 from data_synth.image import replacing
 
@@ -31,13 +32,14 @@ ONE_INACTIVE, MASK_NONE, MASK_ONE, MASK_TWO, ALL_VALUES = 2, 3, 4, 5, 6
 @dataclass
 class VdbGrid:
     """values: (nx, ny, nz) float32 of the active bounding box; first: index of values[0, 0, 0]; voxel_size, origin:
-    world position = origin + voxel_size * index."""
+    world position = origin + voxel_size * index; others: names of the file's other float grids."""
 
     name: str
     values: np.ndarray
     first: np.ndarray
     voxel_size: np.ndarray
     origin: np.ndarray
+    others: tuple[str, ...] = ()
 
 
 class _Reader:
@@ -75,7 +77,7 @@ class _Reader:
 
 
 def read_vdb(path: str | os.PathLike, name: str | None = None) -> VdbGrid:
-    """The float grid called ``name`` (default: the first) as a dense array."""
+    """The float grid called ``name`` as a dense array; by default the one called density, else the first."""
     try:
         r = _Reader(Path(path).read_bytes(), path)
     except OSError as error:
@@ -90,23 +92,26 @@ def read_vdb(path: str | os.PathLike, name: str | None = None) -> VdbGrid:
         raise r.fail("it was written without grid offsets")
     r.take(36)
     r.metadata()
-    count, names = r.number("I"), []
-    for _ in range(count):
-        grid_name, kind = r.string().split("\x1e")[0], r.string()
-        instance = r.string()
+    grids, others = {}, []
+    for _ in range(r.number("I")):
+        grid_name, kind, instance = r.string().split("\x1e")[0], r.string(), r.string()
         position, _, end = (r.number("q") for _ in range(3))
-        names.append(grid_name)
-        if name in (None, grid_name) and kind.startswith("Tree_float_5_4_3") and not instance:
-            r.at = position
-            return _read_grid(r, grid_name, kind.endswith("_HalfFloat"))
+        if kind.startswith("Tree_float_5_4_3") and not instance:
+            grids.setdefault(grid_name, (position, kind.endswith("_HalfFloat")))
+        else:
+            others.append(grid_name)
         r.at = end
-    raise r.fail(f"it holds {', '.join(names) or 'no grid'}, not {name or 'a float grid'}")
+    chosen = name if name is not None else "density" if "density" in grids else next(iter(grids), "")
+    if chosen not in grids:
+        held = f"the float grids {', '.join(grids)}" if grids else "no float grid"
+        held += f" and {', '.join(others)} of other kinds" if others else ""
+        raise r.fail(f"it holds {held}" + (f", not {name}" if name is not None else ""))
+    r.at, half = grids[chosen]
+    return replace(_read_grid(r, chosen, half), others=tuple(other for other in grids if other != chosen))
 
 
 def _read_grid(r: _Reader, name: str, half: bool) -> VdbGrid:
     flags = r.number("I")
-    if flags & BLOSC:
-        raise r.fail("it is compressed with blosc; save it with zip or without compression")
     r.metadata()
     voxel_size, origin = _read_transform(r)
     if r.number("I") != 1:
@@ -184,16 +189,19 @@ class _Tree:
 
     def _numbers(self, n: int) -> np.ndarray:
         kind = "<f2" if self.half else "<f4"
-        if not self.flags & ZIP:
+        if not self.flags & (ZIP | BLOSC):
             return self.r.numbers(kind, n).astype(np.float32)
         size = self.r.number("q")
         if size <= 0:
-            return np.frombuffer(self.r.take(-size), kind).astype(np.float32)
+            if -size != n * np.dtype(kind).itemsize:
+                raise self.r.fail(f"a node of {n} values has {-size} bytes")
+            return self.r.numbers(kind, n).astype(np.float32)
+        data, wanted = self.r.take(size), n * np.dtype(kind).itemsize
         try:
-            data = zlib.decompressobj().decompress(self.r.take(size), n * np.dtype(kind).itemsize)
-            return np.frombuffer(data, kind, count=n).astype(np.float32)
+            plain = decompress(data, wanted) if self.flags & BLOSC else zlib.decompressobj().decompress(data, wanted)
+            return np.frombuffer(plain, kind, count=n).astype(np.float32)
         except (zlib.error, ValueError) as error:
-            raise self.r.fail("its compressed data are damaged") from error
+            raise self.r.fail(f"its compressed data are damaged: {error}") from error
 
     def dense(self) -> tuple[np.ndarray, np.ndarray]:
         """(first index, values) over the active voxels."""

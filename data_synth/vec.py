@@ -86,6 +86,31 @@ def sphere_direction(n, cosine, azimuth):
 
 
 @jit
+def slab(ray, lo, hi, t0, t1):
+    """The part (t0, t1) of [t0, t1] in which a ray is inside an axis-aligned box, t0 > t1 if it misses."""
+    o, d = ray
+    for axis in range(3):
+        if d[axis] == 0.0:
+            if o[axis] < lo[axis] or o[axis] > hi[axis]:
+                return math.inf, -math.inf
+        else:
+            a, b = (lo[axis] - o[axis]) / d[axis], (hi[axis] - o[axis]) / d[axis]
+            t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
+    return t0, t1
+
+
+@jit
+def extent(a):
+    """The largest absolute coordinate: what rounding errors of a point are relative to."""
+    return max(abs(a[0]), abs(a[1]), abs(a[2]))
+
+
+@jit
+def mean(a):
+    return (a[0] + a[1] + a[2]) / 3.0
+
+
+@jit
 def exp_neg(tau):
     """exp(-tau) per colour channel."""
     return (math.exp(-tau[0]), math.exp(-tau[1]), math.exp(-tau[2]))

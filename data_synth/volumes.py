@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import warnings
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from data_synth import media
-from data_synth.errors import InputError
+from data_synth.errors import InputError, RenderWarning
 from data_synth.image import replacing
 from data_synth.vdb import read_vdb, write_vdb
 
@@ -17,26 +18,51 @@ from data_synth.vdb import read_vdb, write_vdb
 def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     """(samples (nx, ny, nz) float32, voxel size (3,)) of a .vdb, .npz, .npy or .raw file.
 
-    npz: the array "density", or the first 3D one, with an optional "voxel_size". raw: a name that ends in
-    _NXxNYxNZ_TYPE.raw, such as head_256x256x128_uint8.raw, x fastest.
+    vdb: the grid called density, or the first; another one by its name, as in smoke.vdb:flame. npz: the array "density",
+    or the first 3D one, with an optional "voxel_size". raw: a name that ends in _NXxNYxNZ_TYPE.raw, such as
+    head_256x256x128_uint8.raw, x fastest.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: expected a volume file (.vdb, .npz, .npy or .raw), found no such file")
-    spacing = np.ones(3)
-    if path.suffix == ".vdb":
-        grid = read_vdb(path)
-        values, spacing = grid.values, grid.voxel_size
-    elif path.suffix in (".npz", ".npy"):
-        values, spacing = _read_numpy(path)
-    elif path.suffix == ".raw":
-        values = _read_raw(path)
+    text, colon, name = str(path).rpartition(":")
+    given = Path(path)
+    if colon and text.endswith(".vdb") and not given.exists():
+        given = Path(text)
     else:
-        raise InputError(f"{path}: expected a volume that ends in .vdb, .npz, .npy or .raw")
-    values = np.asarray(values, np.float32)
-    if values.ndim != 3 or min(values.shape) < 2 or not np.isfinite(values).all():
-        raise InputError(f"{path}: expected finite samples in 3 dimensions, got shape {values.shape}")
-    return values, np.asarray(spacing, float)
+        name = ""
+    if not given.is_file():
+        raise InputError(f"{given}: expected a volume file (.vdb, .npz, .npy or .raw), found no such file")
+    spacing = np.ones(3)
+    if given.suffix == ".vdb":
+        values, spacing = _read_grid(given, name or None)
+    elif given.suffix in (".npz", ".npy"):
+        values, spacing = _read_numpy(given)
+    elif given.suffix == ".raw":
+        values = _read_raw(given)
+    else:
+        raise InputError(f"{given}: expected a volume that ends in .vdb, .npz, .npy or .raw")
+    return _checked(given, values, spacing)
+
+
+def _read_grid(path: Path, name: str | None) -> tuple[np.ndarray, np.ndarray]:
+    grid = read_vdb(path, name)
+    if grid.others and name is None:
+        others = ", ".join(grid.others)
+        notice = f"{path}: took the grid {grid.name}; {path.name}:NAME takes another ({others})"
+        warnings.warn(notice, RenderWarning, stacklevel=3)
+    return grid.values, grid.voxel_size
+
+
+def _checked(path: Path, values: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if values.dtype.kind not in "fiub":
+        raise InputError(f"{path}: expected an array of numbers, got {values.dtype}")
+    if values.ndim != 3 or min(values.shape) < 2:
+        raise InputError(f"{path}: expected samples in 3 dimensions, at least 2 along each, got shape {values.shape}")
+    values = values.astype(np.float32)
+    if not np.isfinite(values).all():
+        wrong = int(values.size - np.isfinite(values).sum())
+        raise InputError(f"{path}: expected finite samples, got {wrong} that are infinite or no number")
+    if spacing.dtype.kind not in "fiu" or spacing.shape != (3,) or not (np.isfinite(spacing) & (spacing > 0)).all():
+        raise InputError(f"{path}: expected a voxel size of three positive numbers, got {spacing}")
+    return values, spacing.astype(float)
 
 
 def _read_numpy(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +75,7 @@ def _read_numpy(path: Path) -> tuple[np.ndarray, np.ndarray]:
             if not names:
                 raise InputError(f"{path}: expected a 3D array, got {', '.join(stored.files) or 'nothing'}")
             spacing = stored["voxel_size"] if "voxel_size" in stored.files else np.ones(3)
-            return stored[names[0]], spacing
+            return stored[names[0]], np.broadcast_to(spacing, (3,)) if spacing.size == 1 else spacing
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         if isinstance(error, InputError):
             raise

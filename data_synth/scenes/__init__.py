@@ -28,7 +28,7 @@ LIGHTS = {
     "sky": lights.sky((0.35, 0.55, 1.0), 0.75, 0.25),
     "white": lights.environment(1.0),
     "lamp": lights.point((1.6, -1.6, 2.0), (18.0, 15.0, 11.0)),
-    "panel": lights.quad((-0.6, -0.6, 2.4), (0.0, 1.2, 0.0), (1.2, 0.0, 0.0), 14.0),
+    "panel": lights.quad((-0.6, -0.6, 2.4), (0.0, 1.2, 0.0), (1.2, 0.0, 0.0), 14.0, back="clear"),
 }
 
 

@@ -18,6 +18,7 @@ from data_synth.image import Picture
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.scenes import showcase_sdf as sdf
 from data_synth.scenes.showcase_sdf import FLOOR
+from data_synth.vec import slab
 
 SUN = (0.48507125, -0.36380344, 0.79592021)  # unit, towards the sun
 FAR = 1e9
@@ -34,17 +35,6 @@ class Haze(NamedTuple):
 
 
 @jit
-def box_interval(ox, oy, oz, dx, dy, dz, lx, ly, lz, hx, hy, hz):
-    """Ray parameters (t0, t1) inside an axis-aligned box, t0 > t1 if the ray misses; 1/0 = inf does the right thing."""
-    a, b = (lx - ox) / dx, (hx - ox) / dx
-    t0, t1 = min(a, b), max(a, b)
-    a, b = (ly - oy) / dy, (hy - oy) / dy
-    t0, t1 = max(t0, min(a, b)), min(t1, max(a, b))
-    a, b = (lz - oz) / dz, (hz - oz) / dz
-    return max(t0, min(a, b), 0.0), min(t1, max(a, b))
-
-
-@jit
 def sky(dz):
     """Linear sky colour by elevation, dz = sine; dim below the horizon."""
     t = 0.5 + 0.5 * dz
@@ -56,7 +46,8 @@ def sky(dz):
 @jit
 def sphere_trace(ox, oy, oz, dx, dy, dz):
     """(t, object) of the first surface, t = FAR if there is none; |distance| at t is below 1e-8."""
-    t, t1 = box_interval(ox, oy, oz, dx, dy, dz, -1.31, -1.31, FLOOR - 0.11, 1.31, 1.31, FLOOR + 0.9)
+    lo, hi = (-1.31, -1.31, FLOOR - 0.11), (1.31, 1.31, FLOOR + 0.9)
+    t, t1 = slab(((ox, oy, oz), (dx, dy, dz)), lo, hi, 0.0, math.inf)
     for _ in range(256):
         if t >= t1:
             break
@@ -142,7 +133,8 @@ def radiance(haze, ox, oy, oz, dx, dy, dz):
     """The emission-absorption integral along one ray: premultiplied r, g, b, then alpha and sum_i w_i t_i."""
     t_hit, which = sphere_trace(ox, oy, oz, dx, dy, dz)
     reach, half = haze.radius + 3.0 * haze.width, 3.0 * haze.width + 0.10
-    t0, t1 = box_interval(ox, oy, oz, dx, dy, dz, -reach, -reach, haze.height - half, reach, reach, haze.height + half)
+    lo, hi = (-reach, -reach, haze.height - half), (reach, reach, haze.height + half)
+    t0, t1 = slab(((ox, oy, oz), (dx, dy, dz)), lo, hi, 0.0, math.inf)
     t1 = min(t1, t_hit)
     r, g, b, far, trans = 0.0, 0.0, 0.0, 0.0, 1.0
     if t1 > t0:
@@ -217,8 +209,8 @@ class Showcase:
         self.smooth = int(smooth)
         self.parameters: dict = {}
 
-    def render(self, camera: Camera) -> Picture:
-        """One ray per pixel centre; pixels at an edge are the mean of a regular grid of rays."""
+    def render(self, camera: Camera, *, seed: int = 0) -> Picture:
+        """One ray per pixel centre; pixels at an edge are the mean of a regular grid of rays. Nothing is random: seed is ignored."""
         out = np.empty((camera.height, camera.width, 5))
         data = camera.data()
         in_bands(lambda first, last: render_rows(self.haze, data, out, first, last), camera.height)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from data_synth import clouds, lights, materials, media, phase, surfaces
 from data_synth.cameras import Viewpoints
-from data_synth.errors import InputError
+from data_synth.errors import InputError, RenderWarning
 from data_synth.jit import in_bands
 from data_synth.noise import cloud_textures
 from data_synth.scene import Scene
@@ -185,8 +187,11 @@ def _imported(
     if up == "y":  # right-handed: x, y, z -> x, -z, y
         values, spacing = values[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]
     low, high = float(values.min()), float(values.max())
-    if high <= low or high <= 0:
-        raise InputError(f"{volume}: expected a density that varies and is somewhere positive")
+    if high <= 0:
+        raise InputError(f"{volume}: expected a density that is somewhere positive, got at most {high:g}")
+    if low < 0:
+        share = float((values < 0).mean())
+        warnings.warn(f"{volume}: {share:.1%} of the samples are negative and count as 0", RenderWarning, stacklevel=3)
     values = np.clip(values / high, 0.0, 1.0)
     extent = (np.array(values.shape) - 1) * spacing
     room = np.array(hi) - np.array(lo)

@@ -1,12 +1,14 @@
 """OpenVDB, npz and raw volumes: round trips, a real file, hostile files."""
 
 import struct
+import zlib
 
 import numpy as np
 import pytest
 
-from data_synth import media
-from data_synth.errors import InputError
+from data_synth import media, scenes
+from data_synth.blosc import decompress
+from data_synth.errors import InputError, RenderWarning
 from data_synth.vdb import _Reader, _Tree, read_vdb, write_vdb
 from data_synth.volumes import read_volume, write_density
 from tests.fixtures.real import real_data
@@ -74,18 +76,151 @@ def test_inactive_values_of_a_compressed_leaf(code, extra, inactive):
     assert tree.r.at == len(data)
 
 
+def lz4(plain):
+    """A valid LZ4 block: a match of 4 or more where one is near, else literals; the last five bytes are literals."""
+    out, at, literals = bytearray(), 0, 0
+
+    def number(n):
+        while n >= 255:
+            out.append(255)
+            n -= 255
+        out.append(n)
+
+    def emit(end, offset=0, length=0):
+        n = end - literals
+        out.append(min(n, 15) << 4 | (min(length - 4, 15) if length else 0))
+        if n >= 15:
+            number(n - 15)
+        out.extend(plain[literals:end])
+        if length:
+            out.extend(struct.pack("<H", offset))
+            if length - 4 >= 15:
+                number(length - 19)
+
+    while at < len(plain) - 12:
+        offset = next((o for o in (1, 2, 7, 40) if o <= at and plain[at - o : at - o + 4] == plain[at : at + 4]), 0)
+        if not offset:
+            at += 1
+            continue
+        length = 4
+        while at + length < len(plain) - 5 and plain[at + length - offset] == plain[at + length]:
+            length += 1
+        emit(at, offset, length)
+        at += length
+        literals = at
+    emit(len(plain))
+    return bytes(out)
+
+
+def frame(plain, width=4, block=1024, shuffle=True, split=True):
+    """A blosc 1 frame, written from the description of the format."""
+    blocks = [plain[k : k + block] for k in range(0, len(plain), block)]
+    body, starts = b"", []
+    for part in blocks:
+        starts.append(16 + 4 * len(blocks) + len(body))
+        if shuffle:
+            whole = len(part) // width * width
+            part = np.frombuffer(part[:whole], np.uint8).reshape(-1, width).T.tobytes() + part[whole:]
+        n = width if split and len(part) == block and block // width >= 128 else 1
+        for k in range(n):
+            stream = part[k * len(part) // n : (k + 1) * len(part) // n]
+            packed = lz4(stream)
+            stored = packed if len(packed) < len(stream) else stream
+            body += struct.pack("<i", len(stored)) + stored
+    flags = 1 << 5 | (1 if shuffle else 0) | (0 if split else 16)
+    head = struct.pack("<BBBBIII", 2, 1, flags, width, len(plain), block, 16 + 4 * len(blocks) + len(body))
+    return head + struct.pack(f"<{len(blocks)}I", *starts) + body
+
+
+@pytest.mark.parametrize("n, width, block, shuffle, split", [
+    (5000, 4, 1024, True, True), (4096, 4, 4096, True, True), (900, 4, 4096, True, False), (777, 2, 512, False, True), (3, 4, 64, True, True),
+])  # fmt: skip
+def test_blosc_frames(n, width, block, shuffle, split):
+    plain = (np.arange(n) // 37 % 11).astype(np.uint8).tobytes()
+    packed = frame(plain, width, block, shuffle, split)
+    assert decompress(packed, n).tobytes() == plain
+    assert n < 100 or len(packed) < 0.7 * n
+    copied = struct.pack("<BBBBIII", 2, 1, 2, width, n, n, 16 + n) + plain
+    assert decompress(copied, n).tobytes() == plain
+    rng = np.random.default_rng(0)
+    for _ in range(200):  # damage ends in an error or in other bytes, never outside the arrays
+        damaged = bytearray(packed)
+        damaged[int(rng.integers(len(damaged)))] = int(rng.integers(256))
+        try:
+            assert len(decompress(bytes(damaged[: int(rng.integers(1, len(damaged) + 1))]), n)) == n
+        except (ValueError, zlib.error):
+            pass
+
+
 def test_blosc_and_other_formats_are_named(tmp_path, values):
     write_vdb(tmp_path / "a.vdb", values[:9, :9, :9])
     data = (tmp_path / "a.vdb").read_bytes()
     at = data.index(struct.pack("<I", 2) + struct.pack("<I", 5) + b"class") - 4
     (tmp_path / "b.vdb").write_bytes(data[:at] + struct.pack("<I", 4) + data[at + 4 :])
-    with pytest.raises(InputError, match="blosc"):
+    with pytest.raises(InputError, match="b.vdb"):
         read_vdb(tmp_path / "b.vdb")
+    zstd = struct.pack("<BBBBIII", 2, 1, 4 << 5 | 1, 4, 16, 16, 40) + bytes(24)
+    with pytest.raises(ValueError, match="zstd"):
+        decompress(zstd, 16)
     (tmp_path / "c.vdb").write_bytes(b"not a volume at all, only text")
     with pytest.raises(InputError, match="another format"):
         read_vdb(tmp_path / "c.vdb")
     with pytest.raises(InputError, match="cannot be read"):
         read_vdb(tmp_path / "missing.vdb")
+
+
+def two_grids(tmp_path, names):
+    """A file of several float grids, joined from files of one each."""
+    head, entries, at = b"", [], 0
+    for k, name in enumerate(names):
+        write_vdb(tmp_path / "one.vdb", np.full((4, 4, 4), k + 1.0), (0.5,) * 3)
+        data = (tmp_path / "one.vdb").read_bytes()
+        start = data.index(struct.pack("<I", 7) + b"density")
+        head = data[: start - 4]
+        entries.append((name, data[start + 11 : start + 11 + 4 + 16 + 4], data[start + 11 + 24 + 24 :]))
+    at = len(head) + 4
+    out = head + struct.pack("<I", len(names))
+    for name, kind, body in entries:
+        text = struct.pack("<I", len(name)) + name.encode()
+        at += len(text) + len(kind) + 24
+        out += text + kind + struct.pack("<qqq", at, at, at + len(body)) + body
+        at += len(body)
+    (tmp_path / "two.vdb").write_bytes(out)
+    return tmp_path / "two.vdb"
+
+
+@pytest.mark.parametrize("names", [("flame", "density"), ("density", "flame"), ("heat", "flame")])
+def test_grids_by_name(tmp_path, names):
+    """The density wherever it stands, else the first; a sentence says which; FILE.vdb:NAME takes another."""
+    path = two_grids(tmp_path, names)
+    want = "density" if "density" in names else "heat"
+    with pytest.warns(RenderWarning, match=f"took the grid {want}.*flame"):
+        values, spacing = read_volume(path)
+    assert np.all(values == names.index(want) + 1.0) and np.allclose(spacing, 0.5)
+    assert np.all(read_volume(f"{path}:flame")[0] == names.index("flame") + 1.0)
+    with pytest.raises(InputError, match="flame.*not smoke"):
+        read_volume(f"{path}:smoke")
+
+
+@pytest.mark.parametrize("arrays, message", [
+    ({"density": np.full((3, 3, 3), np.nan)}, "27 that are infinite or no number"),
+    ({"density": np.full((3, 3, 3), "a")}, "array of numbers"),
+    ({"density": np.ones((3, 3, 3)), "voxel_size": [1.0, 2.0]}, "three positive"),
+    ({"density": np.ones((3, 3, 3)), "voxel_size": [1.0, 2.0, 0.0]}, "three positive"),
+    ({"density": np.ones((1, 3, 3))}, "at least 2"),
+])  # fmt: skip
+def test_what_is_wrong_with_a_volume_is_said(tmp_path, arrays, message):
+    np.savez(tmp_path / "v.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_volume(tmp_path / "v.npz")
+
+
+def test_negative_and_constant_densities(tmp_path):
+    np.savez(tmp_path / "one.npz", density=np.ones((3, 3, 3)))
+    assert scenes.make("smoke", volume=str(tmp_path / "one.npz")).medium.max_density == 1.0  # a cube of smoke
+    np.savez(tmp_path / "two.npz", density=np.linspace(-1, 2, 27).reshape(3, 3, 3))
+    with pytest.warns(RenderWarning, match="33.3% of the samples are negative"):
+        scenes.make("phantom", volume=str(tmp_path / "two.npz"))
 
 
 def test_numpy_and_raw(tmp_path):
