@@ -67,7 +67,8 @@ def run(options: EvalOptions) -> int:
     data = options.data or run_settings(options.target).get("data")
     if not data:
         raise InputError(f"nerfvol eval needs --data DIR: {options.target} has no config.yaml that says what it saw")
-    dataset = load_dataset(data, options.split, options.downscale)
+    kind = run_settings(options.target).get("scene")
+    dataset = load_dataset(data, options.split, options.downscale, scene="auto" if kind is None else kind)
     for message in dataset.messages:
         print(message, file=sys.stderr)
     drawing = target.background, options.early_stop_eps, options.lod
