@@ -22,11 +22,13 @@ class SceneBounds:
     ``background_cube`` (2, 3) or None: the larger cube, concentric with ``aabb``, that the background shells of
     photographs fill; None where the background is not part of the scene.
     ``has_alpha``: the images have transparent pixels, seen over whatever background is asked for.
+    ``is_guess``: the cameras alone do not tell where the scene is.
     """
 
     aabb: NDArray[np.float64]
     background_cube: NDArray[np.float64] | None
     has_alpha: bool
+    is_guess: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "aabb", check_box(self.aabb, "the scene's aabb"))

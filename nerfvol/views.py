@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from nerfvol.models import Model
 
 Float = NDArray[np.float32]
+_FAR, _SMALLEST, _LARGEST = 16.0, 2.0**-8, 2.0**20
+# Sides of the root cube from the origin, and sides in scene units, beyond which float32 loses digits that are seen.
 NEAREST = 1e-3
 """Of the extent of splats: what is nearer to a camera is not drawn, where the file says no more."""
 
@@ -51,8 +54,41 @@ def render_image(
     if not 0 <= lod < np.inf:
         raise ValueError(f"lod must be a number of pixels, 0 or more and finite, got {lod}")
     lens = camera.intrinsics
-    view = ops.View(_directions(lens), camera.c2w, lens.height, lens.width)
-    return ops.render_view(octree, view, background, early_stop_eps, outputs, lod / max(lens.fx, lens.fy))
+    near, pose, scale = _near_origin(octree, camera)
+    view = ops.View(_directions(lens), pose, lens.height, lens.width)
+    out = ops.render_view(near, view, background, early_stop_eps, outputs, lod / max(lens.fx, lens.fy))
+    if near is not octree:
+        octree.prefiltered = near.prefiltered
+        for name in ("depth", "median_depth"):
+            if name in out:
+                out[name] *= np.float32(scale)
+    return _beyond_reach(out, lens, background)
+
+
+def _near_origin(octree: Octree, camera: Camera) -> tuple[Octree, NDArray[np.float64], float]:
+    """Octree, pose and the length of a unit, scene units, as float32 can hold them; as they are for ordinary octrees.
+
+    Kernels compute in float32 from the world's origin, of which map coordinates leave nothing of the digits of a scene.
+    """
+    middle = octree.origin + octree.size / 2
+    far = bool(np.abs(middle).max() > _FAR * octree.size)
+    extreme = not _SMALLEST <= octree.size <= _LARGEST
+    if not (far or extreme):
+        return octree, camera.c2w, 1.0
+    scale, near, pose = (octree.size if extreme else 1.0), copy.copy(octree), camera.c2w.copy()
+    near.origin, near.size = (octree.origin - middle) / scale, octree.size / scale
+    near.density_scale = octree.density_scale * scale
+    pose[:3, 3] = (pose[:3, 3] - middle) / scale
+    return near, pose, scale
+
+
+def _beyond_reach(out: dict[str, Float], lens: Intrinsics, background: Sequence[float]) -> dict[str, Float]:
+    """The picture with background, and nothing of anything else, where the lens does not reach."""
+    seen = lens.seen()
+    if seen is not None:
+        for name, picture in out.items():
+            picture[~seen] = np.asarray(background, np.float32) if name == "rgb" else 0.0
+    return out
 
 
 @functools.lru_cache(maxsize=1)
@@ -231,7 +267,7 @@ class SplatModel:
             view = view_of(seen, self.packed.origin, max(self.near, self._nearest(seen)))
             return operator(self.packed, view, colour, early_stop_eps, outputs)
 
-        return through_lens(pinhole, camera)
+        return _beyond_reach(through_lens(pinhole, camera), camera.intrinsics, colour)
 
     def aabb(self) -> NDArray[np.float64]:
         """(2, 3) corners of the box around the middle 98 % of the means, three deviations wide: few lie far out."""

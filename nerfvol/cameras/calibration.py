@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,15 +13,15 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Intrinsics
 from nerfvol.cameras.lens import PINHOLE, BrownConrady, Fisheye, Lens
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 
 
 @dataclass(frozen=True)
 class Calibration:
     """Intrinsics as a file states them; what it leaves open (None) follows from the image's size.
 
-    ``resizable``: the figures are for the original photographs and the folder may hold them uniformly resized;
-    otherwise an image of another size than (width, height) is an error.
+    Images that are uniformly larger or smaller than (width, height) get figures of their own size. ``resizable``: by any
+    factor, as formats mean it that keep the original photographs' figures; else by 1.3 or more, and less is an error.
     """
 
     width: int | None = None
@@ -39,7 +40,7 @@ class Calibration:
 
         Raises:
             InputError: no focal length is stated, a field of view outside (0, pi), an image of another size than is stated
-                unless it may be resized uniformly, or figures that Intrinsics refuses.
+                unless it is uniformly resized, or figures that Intrinsics refuses.
         """
         sx, sy = self._resize(width, height)
         fx = self.fx * sx if self.fx is not None else _focal(self.angle_x, width)
@@ -51,16 +52,59 @@ class Calibration:
         cy = 0.5 * height if self.cy is None else self.cy * sy
         return Intrinsics(width, height, fx, fy, cx, cy, self.lens)
 
+    def made_for(self, width: int, height: int) -> tuple[int, int]:
+        """(width, height) of the pictures that the figures are for, where the image has width x height pixels.
+
+        Stated sizes count; else a principal point far from the middle of the image tells: where it is the middle of pictures
+        that are uniformly larger or smaller, it is theirs.
+        """
+        if self.width is not None or self.height is not None:
+            return (self.width or width), (self.height or height)
+        if self.cx is None or self.cy is None or not (self.fx or self.fy):
+            return width, height
+        sx, sy = 2 * self.cx / width, 2 * self.cy / height
+        resized = not 1 / _DELIBERATE < (sx + sy) / 2 < _DELIBERATE and abs(sx - sy) < _ALIKE * (sx + sy) / 2
+        return (round(sx * width), round(sy * height)) if resized and min(sx, sy) > 0 else (width, height)
+
+    def is_off(self, width: int, height: int) -> bool:
+        """Whether the principal point is more than a quarter of the image from its middle, as a crop or a mistake has it."""
+        lens = self.intrinsics(width, height)
+        return max(abs(lens.cx - width / 2) / width, abs(lens.cy - height / 2) / height) > 0.25
+
+    def turns(self, width: int, height: int) -> bool:
+        """Whether the figures are for the picture of width x height pixels lying on its side, and not as it is."""
+        if width == height:
+            return False
+        if self.width is not None and self.height is not None:
+            return not _uniform((self.width, self.height), (width, height)) and _uniform(
+                (self.width, self.height), (height, width)
+            )
+        if self.cx is None or self.cy is None:
+            return False
+        as_is = max(abs(2 * self.cx / width - 1), abs(2 * self.cy / height - 1))
+        on_side = max(abs(2 * self.cx / height - 1), abs(2 * self.cy / width - 1))
+        return on_side < 0.1 < as_is and on_side < as_is / 2
+
     def _resize(self, width: int, height: int) -> tuple[float, float]:
-        stated = (self.width or width, self.height or height)
+        stated = self.made_for(width, height)
         if stated == (width, height):
             return 1.0, 1.0
         sx, sy = width / stated[0], height / stated[1]
-        # a resized side is rounded to whole pixels: the two scales agree to about a pixel over the smaller image
-        if self.resizable and abs(sx - sy) * min(stated) <= 2:
+        if _uniform(stated, (width, height)) and (self.resizable or not 1 / _DELIBERATE < sx < _DELIBERATE):
             return sx, sy
         expected = f"{stated[0]}x{stated[1]} pixels as its calibration states"
         raise InputError(f"expected an image of {expected}, got {width}x{height}")
+
+
+_DELIBERATE = 1.3
+"""Pictures of another size than is stated are taken for resized ones by at least this factor; by less it is a mistake."""
+_ALIKE = 0.03
+
+
+def _uniform(stated: tuple[int, int], found: tuple[int, int]) -> bool:
+    """Whether one scale makes ``found`` of ``stated``, (width, height): a resized side is rounded to whole pixels, so that
+    the two scales agree to about a pixel over the smaller image."""
+    return abs(found[0] / stated[0] - found[1] / stated[1]) * min(stated) <= 2
 
 
 def _focal(angle: float | None, size: int) -> float | None:
@@ -71,6 +115,11 @@ def _focal(angle: float | None, size: int) -> float | None:
     return 0.5 * size / math.tan(0.5 * angle)
 
 
+CALIBRATION_KEYS = {
+    "camera_model", "is_fisheye", "ftheta_p0", "latlong", "equirectangular", "w", "h", "fl_x", "fl_y", "cx", "cy", "x_fov",
+    "y_fov", "camera_angle_x", "camera_angle_y", *BrownConrady.names(), *Fisheye.names(),
+}  # fmt: skip
+"""What :func:`read_calibration` looks at."""
 CAMERA_MODELS: dict[str, type[Lens]] = {
     "OPENCV": BrownConrady,
     "PINHOLE": BrownConrady,
@@ -85,11 +134,15 @@ _DEFAULT_MODEL = "OPENCV"
 
 
 def read_matrix(value: Any) -> NDArray[np.float64]:
-    """The float64 array of a JSON list of numbers, in the shape of the list; InputError where it is none."""
+    """The float64 array of a JSON list of numbers, in the shape of the list, and in rows of 4 where it is one of 12 or 16.
+
+    InputError where it is none.
+    """
     try:
-        return np.array(value, dtype=np.float64)
+        matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"transform_matrix must be 4 rows of 4 numbers, got {value!r:.60}") from None
+        raise InputError(f"transform_matrix must be 4 rows of 4 numbers, got {shown(value):.60}") from None
+    return matrix.reshape(-1, 4) if matrix.shape in ((12,), (16,)) else matrix
 
 
 def finite_number(data: Mapping[str, Any], *keys: str) -> float | None:
@@ -102,8 +155,11 @@ def finite_number(data: Mapping[str, Any], *keys: str) -> float | None:
         value = data.get(key)
         if value is None:
             continue
+        if isinstance(value, str):  # some exporters quote their numbers
+            with contextlib.suppress(ValueError):
+                value = float(value)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-            raise InputError(f"{key} must be a finite number, got {value!r:.40}")
+            raise InputError(f"{key} must be a finite number, got {shown(value):.60}")
         return float(value)
     return None
 
@@ -115,8 +171,9 @@ def read_calibration(data: Mapping[str, Any]) -> Calibration:
         InputError: a value that is no number, an unknown or unsupported camera_model.
     """
     model = data.get("camera_model", _DEFAULT_MODEL)
+    model = model.upper() if isinstance(model, str) else model
     if not isinstance(model, str) or model not in CAMERA_MODELS:
-        raise InputError(f"camera_model {model!r:.40} is not supported; known models: {', '.join(CAMERA_MODELS)}")
+        raise InputError(f"camera_model {shown(model):.60} is not supported; known models: {', '.join(CAMERA_MODELS)}")
     unsupported = [key for key in ("ftheta_p0", "latlong", "equirectangular") if data.get(key)]
     if unsupported:
         raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")

@@ -13,6 +13,7 @@ Conventions, for the whole package:
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from collections import OrderedDict
@@ -28,7 +29,9 @@ from nerfvol.errors import InputError
 Float = NDArray[np.float64]
 
 TILE_SIDE = 8
-RIGID_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 5e-3
+"""Of R^T R from the identity: three decimals in a file leave up to 2e-3, and 4e-3 where they were scaled by a third first."""
+_OPENGL = np.array([1.0, -1.0, -1.0])  # OpenCV axes (y down, z forward) to OpenGL axes
 _CACHE_BYTES = 256 << 20
 FARTHEST = 1e15  # positions beyond it overflow in float32 squares, and float32 rays from there see nothing
 
@@ -135,16 +138,30 @@ class Intrinsics:
         """(height, width, 3) float32 unit directions of pixel centres in camera axes; shared, so not to be written."""
         return _directions.get(self)
 
+    def seen(self) -> NDArray[np.bool_] | None:
+        """(height, width) bool: the pixels that lie within the lens's reach; None where all do. Others have no ray."""
+        return _reaches(self)
+
     def directions_at(self, pixels: ArrayLike) -> Float:
-        """Unit directions (n, 3) float64, camera axes, of positions (n, 2) in pixels; pixel centres end in 1/2."""
+        """Unit directions (n, 3) float64, camera axes, of positions (n, 2) in pixels; pixel centres end in 1/2.
+
+        Raises:
+            InputError: a position beyond the lens's reach, which has no direction.
+        """
+        return self.lens.undistort(self._plane(pixels)) * _OPENGL
+
+    def directions_where(self, pixels: ArrayLike) -> tuple[Float, NDArray[np.bool_]]:
+        """As :meth:`directions_at`, and which positions have a direction, (n,) bool; the others look along the axis."""
+        directions, found = self.lens.undistort_where(self._plane(pixels))
+        return directions * _OPENGL, found
+
+    def _plane(self, pixels: ArrayLike) -> Float:
         p = np.asarray(pixels, dtype=np.float64)
-        plane = np.stack([(p[:, 0] - self.cx) / self.fx, (p[:, 1] - self.cy) / self.fy], axis=1)
-        directions = self.lens.undistort(plane)
-        return directions * np.array([1.0, -1.0, -1.0])  # OpenCV axes (y down, z forward) to OpenGL axes
+        return np.stack([(p[:, 0] - self.cx) / self.fx, (p[:, 1] - self.cy) / self.fy], axis=1)
 
     def project(self, points: ArrayLike) -> Float:
         """Image positions (n, 2), in pixels, of points (n, 3) in camera axes; NaN where the lens cannot see them."""
-        p = np.asarray(points, dtype=np.float64) * np.array([1.0, -1.0, -1.0])
+        p = np.asarray(points, dtype=np.float64) * _OPENGL
         return self.lens.distort(p) * (self.fx, self.fy) + (self.cx, self.cy)
 
 
@@ -179,11 +196,21 @@ class _DirectionCache:
         for top in range(0, height, band):
             rows = np.arange(top, min(top + band, height)) + 0.5
             pixels = np.stack(np.broadcast_arrays(columns[None, :], rows[:, None]), axis=-1).reshape(-1, 2)
-            out[top : top + len(rows)] = intrinsics.directions_at(pixels).reshape(len(rows), width, 3)
+            out[top : top + len(rows)] = intrinsics.directions_where(pixels)[0].reshape(len(rows), width, 3)
         return out
 
 
 _directions = _DirectionCache(_CACHE_BYTES)
+
+
+@functools.lru_cache(maxsize=32)
+def _reaches(intrinsics: Intrinsics) -> NDArray[np.bool_] | None:
+    width, height = intrinsics.width, intrinsics.height
+    corners = np.array([(x, y) for x in (0.5, width - 0.5) for y in (0.5, height - 0.5)])
+    if intrinsics.directions_where(corners)[1].all():  # reach is a disc: what holds the corners holds the picture
+        return None
+    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return intrinsics.directions_where(np.stack([columns.ravel(), rows.ravel()], 1))[1].reshape(height, width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +218,7 @@ class Camera:
     """Intrinsics and a rigid pose.
 
     ``c2w`` (4, 4) or (3, 4) must be a rotation and a translation: its 3x3 part orthonormal and right-handed to within
-    1e-3, as tools that write a few decimals leave it; it is then replaced by the nearest exact rotation so that
+    5e-3, as tools that write three decimals leave it; it is then replaced by the nearest exact rotation so that
     |d| = 1 holds to rounding. Scaled, mirrored, sheared and non-finite poses raise InputError.
     """
 
@@ -240,7 +267,7 @@ def rigid_pose(c2w: ArrayLike) -> Float:
     1966).
 
     Raises:
-        InputError: the matrix is no rigid pose to within 1e-3, is not finite or lies beyond 1e15 units.
+        InputError: the matrix is no rigid pose to within 5e-3, is not finite or lies beyond 1e15 units.
     """
     matrix = np.asarray(c2w, dtype=np.float64)
     if matrix.shape not in ((4, 4), (3, 4)):
@@ -250,7 +277,9 @@ def rigid_pose(c2w: ArrayLike) -> Float:
     if not np.abs(matrix[:3, 3]).max() < FARTHEST:
         raise InputError(f"a camera must be within {FARTHEST:g} units of the origin, got {_numbers(matrix[:3, 3])}")
     if matrix.shape == (4, 4) and np.abs(matrix[3] - (0, 0, 0, 1)).max() > RIGID_TOLERANCE:
-        raise InputError(f"the last row of a camera pose must be 0 0 0 1, got {_numbers(matrix[3])}")
+        turned = np.abs(matrix[:3, 3]).max() <= RIGID_TOLERANCE
+        hint = ": is the matrix transposed, with the position in its last row?" if turned else ""
+        raise InputError(f"the last row of a camera pose must be 0 0 0 1, got {_numbers(matrix[3])}{hint}")
     r = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(r.T @ r - np.eye(3)).max()
@@ -267,6 +296,30 @@ def rigid_pose(c2w: ArrayLike) -> Float:
     out[:3, :3] = u @ vt
     out[:3, 3] = matrix[:3, 3]
     return out
+
+
+def unscaled_pose(c2w: ArrayLike) -> tuple[Float, float]:
+    """The rigid pose (4, 4) of a camera-to-world matrix whose axes may be too long or short, and by what factor they were.
+
+    Rays are unit vectors, so that the lengths of a camera's axes say nothing of the scene: each column of the 3x3 part is
+    divided by its own. Axes of different lengths give their geometric mean as the factor; 1 where the matrix was rigid.
+
+    Raises:
+        InputError: see rigid_pose; axes that are not perpendicular, left-handed, or shorter than 1e-9.
+    """
+    matrix = np.array(c2w, dtype=np.float64)
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        return rigid_pose(matrix), 1.0
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if np.abs(lengths**2 - 1).max() <= RIGID_TOLERANCE or not 1e-9 < lengths.min() <= lengths.max() < 1e9:
+        return rigid_pose(matrix), 1.0
+    whole = matrix.copy()
+    whole[:3, :3] /= lengths
+    try:
+        return rigid_pose(whole), float(np.prod(lengths)) ** (1 / 3)
+    except InputError:
+        return rigid_pose(matrix), 1.0  # its sentence names the lengths as they are in the file
 
 
 def _numbers(values: ArrayLike) -> str:

@@ -49,7 +49,7 @@ def canvas_of(intrinsics: Intrinsics, max_angle: float = MAX_ANGLE) -> Canvas:
         raise InputError(f"a canvas may reach 0 to 80 degrees from the axis, got {math.degrees(max_angle):g}")
     if is_pinhole(intrinsics):
         return Canvas(intrinsics, math.inf, False)
-    directions = intrinsics.directions_at(_border(intrinsics))
+    directions = _outermost(intrinsics)
     ahead = -directions[:, 2]
     limit = math.tan(max_angle)
     # What is far off the axis, or behind it, only needs to lie beyond the limit on its own side.
@@ -63,6 +63,23 @@ def canvas_of(intrinsics: Intrinsics, max_angle: float = MAX_ANGLE) -> Canvas:
     width, height = (int(n) for n in np.maximum(last - first, 1))
     camera = Intrinsics(width, height, intrinsics.fx, intrinsics.fy, -float(first[0]), -float(first[1]))
     return Canvas(camera, radius, cropped)
+
+
+def _outermost(intrinsics: Intrinsics) -> Float:
+    """Directions (n, 3), camera axes, of the border of what the photograph shows: its edge, or where the lens's reach ends."""
+    border = _border(intrinsics)
+    directions, found = intrinsics.directions_where(border)
+    if found.all():
+        return directions
+    axis = np.array([intrinsics.cx, intrinsics.cy])
+    inner, outer = np.zeros(len(border)), np.ones(len(border))
+    for _ in range(30):  # of the way from the axis to the edge, how far the lens reaches
+        middle = (inner + outer) / 2
+        reached = intrinsics.directions_where(axis + middle[:, None] * (border - axis))[1]
+        inner, outer = np.where(reached, middle, inner), np.where(reached, outer, middle)
+    share = np.where(found, 1.0, inner * (1 - 1e-9))
+    directions, found = intrinsics.directions_where(axis + share[:, None] * (border - axis))
+    return directions[found] if found.any() else intrinsics.directions_at(border)
 
 
 def _border(intrinsics: Intrinsics) -> Float:

@@ -68,11 +68,21 @@ class Lens(ABC):
         Raises:
             InputError: no direction does: beyond the radius where its polynomial turns back a lens has no inverse.
         """
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows does not converge, and is refused
-            return self._undistort(plane)
+        directions, found = self.undistort_where(plane)
+        if not found.all():
+            raise self._no_inverse(plane)
+        return directions
+
+    def undistort_where(self, plane: Float) -> tuple[Float, NDArray[np.bool_]]:
+        """Unit directions (n, 3) as of :meth:`undistort`, and where there is one, (n,) bool; elsewhere along the axis."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what overflows does not converge
+            directions = self._undistort(plane)
+        found = np.isfinite(directions).all(axis=1)
+        return np.where(found[:, None], directions, (0.0, 0.0, 1.0)), found
 
     @abstractmethod
-    def _undistort(self, plane: Float) -> Float: ...
+    def _undistort(self, plane: Float) -> Float:
+        """Unit directions (n, 3) of positions (n, 2); NaN where no direction lands there."""
 
     def _no_inverse(self, plane: Float) -> InputError:
         radius = float(np.sqrt((plane * plane).sum(axis=1)).max())
@@ -134,10 +144,11 @@ class BrownConrady(Lens):
         d = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
         return d / np.sqrt((d * d).sum(axis=1, keepdims=True))
 
-    def _solve(self, plane: Float) -> Float:
+    def _solve(self, plane: Float) -> tuple[Float, NDArray[np.bool_]]:
         """Undistorted positions (n, 2), on the branch that contains the axis: a step off it is pulled back inwards."""
         x, y = plane[:, 0].copy(), plane[:, 1].copy()
         p1, p2, fold = self.p1, self.p2, self._fold
+        found = np.zeros(len(plane), dtype=bool)
         for _ in range(_MAX_STEPS):
             s = x * x + y * y
             radial, slope = _polynomial(s, self._radial)
@@ -152,9 +163,10 @@ class BrownConrady(Lens):
             safe = np.where(good, det, 1.0)
             x = np.where(good, x - (jyy * ex - jxy * ey) / safe, _PULL * x)
             y = np.where(good, y - (jxx * ey - jxy * ex) / safe, _PULL * y)
-            if done.all() and np.sqrt(x * x + y * y).max(initial=0.0) <= fold:
-                return np.stack([x, y], axis=1)
-        raise self._no_inverse(plane)
+            found = done & (np.sqrt(x * x + y * y) <= fold)
+            if found.all():
+                break
+        return np.where(found[:, None], np.stack([x, y], axis=1), np.nan)
 
 
 @dataclass(frozen=True)
@@ -201,15 +213,17 @@ class Fisheye(Lens):
 
     def _solve(self, theta_d: Float) -> Float:
         theta, fold = theta_d.copy(), _fold(self._radial)
+        found = np.zeros(len(theta_d), dtype=bool)
         for _ in range(_MAX_STEPS):
             value, slope = self._radius(theta)
             error = value - theta_d
             good = (slope > 0) & (theta <= np.pi)
             done = good & (np.abs(error) <= TOLERANCE * (1 + theta))
             theta = np.where(good, theta - error / np.where(good, slope, 1.0), _PULL * theta)
-            if done.all() and theta.max(initial=0.0) <= fold:
-                return theta
-        raise self._no_inverse(theta_d[:, None])
+            found = done & (theta <= fold)
+            if found.all():
+                break
+        return np.where(found, theta, np.nan)
 
 
 PINHOLE = BrownConrady()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
 from nerfvol.config.assemble import assemble, parse_assignment, read_yaml
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 
 LAYERED = "Any option can stand in a YAML file given with --config (time_budget: 2m); the command line wins over it."
 
@@ -89,12 +90,13 @@ def set_threads(threads: int) -> int:
     """Use ``threads`` CPU threads (0: every core this process may use) in torch and the kernels; returns the number.
 
     Raises:
-        InputError: fewer than 0.
+        InputError: fewer than 0, or more than make sense.
     """
+    from nerfvol.config.training import MOST_THREADS
     from nerfvol.machine import usable_cores
 
-    if threads < 0:
-        raise InputError(f"--threads must be 0 (all cores) or more, got {threads}")
+    if not 0 <= threads <= MOST_THREADS:
+        raise InputError(f"--threads must be from 0 (all cores) to {MOST_THREADS}, got {shown(threads)}")
     count = threads or usable_cores()
     from nerfvol.kernels import ops
 
@@ -104,9 +106,9 @@ def set_threads(threads: int) -> int:
 
 def prepare_outputs(folder: str | None = None, file: str | None = None) -> None:
     """Make the folders that a command will write to, before it spends time on what it writes."""
-    from nerfvol.files.atomic import ensure_writable_folder
+    from nerfvol.files.atomic import ensure_writable_folder, is_special
 
     if folder is not None:
         ensure_writable_folder(folder)
-    if file is not None:
-        ensure_writable_folder(Path(file).parent)
+    if file is not None and not is_special(file):
+        ensure_writable_folder(Path(os.path.realpath(file)).parent)

@@ -75,8 +75,11 @@ def run(options: EvalOptions) -> int:
     data = options.data or run_settings(options.target).get("data")
     if not data:
         raise InputError(f"nerfvol eval needs --data DIR: {options.target} has no config.yaml that says what it saw")
-    holdout = options.holdout or ("own" if options.data else run_settings(options.target).get("holdout", "own"))
-    dataset = load_dataset(data, options.split, options.downscale, holdout=holdout)
+    settings = run_settings(options.target)
+    holdout = options.holdout or ("own" if options.data else settings.get("holdout", "own"))
+    kind = settings.get("scene")
+    scene = "auto" if kind is None else kind
+    dataset = load_dataset(data, options.split, options.downscale, holdout=holdout, scene=scene)
     for message in dataset.messages:
         print(message, file=sys.stderr)
     drawing = target.background, options.early_stop_eps, options.lod

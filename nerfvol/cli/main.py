@@ -7,16 +7,16 @@ imported inside the command that needs them, so that help and mistakes answer at
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
-import os
 import pkgutil
 import sys
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import nerfvol.cli
 from nerfvol import __version__
 from nerfvol.cli.command import LAYERED, Command, Parser, assemble_options
+from nerfvol.cli.terminal import Screen, screens
 from nerfvol.errors import InputError
 
 _DESCRIPTION = """\
@@ -38,6 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def guard(run: Callable[[], int]) -> int:
     """The exit code of ``run``; what the user has to put right is said in one sentence instead of a traceback."""
+    with screens():
+        return _guarded(run)
+
+
+def _guarded(run: Callable[[], int]) -> int:
     try:
         code = run()
         sys.stdout.flush()
@@ -46,9 +51,8 @@ def guard(run: Callable[[], int]) -> int:
         print("nerfvol: interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader (head, a pager) has gone. Point stdout elsewhere, or the interpreter's own flush complains at exit.
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # The reader (head, a pager) has gone.
+        cast(Screen, sys.stdout).silence()
         return 141
     except Exception as error:
         sentence = _sentence(error)

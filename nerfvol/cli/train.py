@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfvol.cli.command import Command, assemble_options, need, set_threads
+from nerfvol.cli.terminal import go_on_without_reader
 from nerfvol.config.assemble import read_yaml
 from nerfvol.config.training import Config
 from nerfvol.datasets.formats import formats_help
@@ -30,12 +31,14 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "
                    "a fixed number of steps, the same result every time (default: none)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B from 0 to 1: what images with alpha "
-                   "are composited on (default: white)")  # fmt: skip
+                   "are composited on (default: white, or the plain backdrop that they show)")  # fmt: skip
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
     p.add_argument("--aabb", metavar="X0,Y0,Z0,X1,Y1,Z1", help="the region of detail in the units of the poses: lowest "
                    "and highest corner (default: worked out from the cameras)")  # fmt: skip
     p.add_argument("--holdout", metavar="own|arc", help="views that are scored, not trained on. own: the data's, or every 8th; "
                    "arc: an eighth of the training views, next to each other, which asks for more (default: own)")  # fmt: skip
+    p.add_argument("--scene", metavar="KIND", help="auto, object (before nothing or a plain backdrop), surroundings (around a "
+                   "subject), room (seen from inside) or forward (all look one way) (default: auto)")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")
@@ -63,6 +66,7 @@ def run(given: dict[str, Any]) -> int:
     if not Path(config.data).exists():
         raise InputError(f"--data {config.data}: no such folder or file")
     set_threads(config.threads)
+    go_on_without_reader()
     from nerfvol.training.train import train
 
     results = train(config)

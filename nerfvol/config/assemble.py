@@ -11,30 +11,58 @@ import copy
 import dataclasses
 import difflib
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 
 from nerfvol.config.values import Checked, coerce, hints_of
-from nerfvol.errors import InputError
-from nerfvol.files.atomic import read_bytes, write_text
+from nerfvol.errors import InputError, shown
+from nerfvol.files.atomic import read_text, write_text
 from nerfvol.files.run_folder import CONFIG
 
 T = TypeVar("T")
 
 
-def assemble(cls: type[T], *layers: tuple[Mapping[str, Any], str]) -> T:
+class _Loader(yaml.SafeLoader):
+    """Plain values only, without aliases (which make a gigabyte of some lines) and with each key once."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.MarkedYAMLError(problem="aliases are not read", problem_mark=mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        seen = set()
+        for key, _ in node.value:
+            name = key.value if isinstance(key.value, str) else None
+            if name is not None and name in seen:
+                raise yaml.MarkedYAMLError(problem=f"{shown(name)} is stated twice", problem_mark=key.start_mark)
+            seen.add(name)
+        return super().construct_mapping(node, deep=deep)
+
+
+def _to_standard_error(sentence: str) -> None:
+    print(f"nerfvol: {sentence}", file=sys.stderr)
+
+
+def assemble(
+    cls: type[T], *layers: tuple[Mapping[str, Any], str], say: Callable[[str], object] = _to_standard_error
+) -> T:
     """An instance of the dataclass ``cls``: its defaults, then each ``(mapping, source name)`` on top of the last.
 
+    A key that was renamed is taken for what it is called now; ``say`` gets a sentence about it.
+
     Raises:
-        InputError: an unknown key (a near one is named, and what a former one is called now), a value that does not fit
+        InputError: an unknown key (a near one is named), a value that does not fit
             its annotation, or settings that do not fit each other.
     """
     settings = cls()
     for mapping, source in layers:
-        _update(settings, mapping, source, "")
+        _update(settings, mapping, source, "", say)
     _check(settings)
     return settings
 
@@ -46,7 +74,7 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
         InputError: the file cannot be read, is no YAML, or holds something else than keys and values.
     """
     try:
-        document = yaml.safe_load(read_bytes(path).decode("utf-8"))
+        document = yaml.load(read_text(path), Loader=_Loader)
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a config file: it is not UTF-8 text") from error
     except yaml.YAMLError as error:
@@ -56,6 +84,10 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise InputError(f"{path} is not a config file: {problem}{place}") from error
     except RecursionError as error:
         raise InputError(f"{path} is not a config file: it is nested too deeply") from error
+    except InputError:
+        raise
+    except ValueError as error:  # a number of more digits than Python converts, a date that is none
+        raise InputError(f"{path} is not a config file: it holds a number or date that cannot be read") from error
     if document is None:
         return {}
     if not isinstance(document, dict):
@@ -83,9 +115,9 @@ def parse_assignment(text: str) -> dict[str, Any]:
     if not equals or not all(part.isidentifier() for part in key.split(".")):
         raise InputError(f"--set expects KEY=VALUE such as octree.sh_degree=2, got {text!r}")
     try:
-        nested: Any = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise InputError(f"--set {key}: {value!r} is not a YAML value") from error
+        nested: Any = yaml.load(value, Loader=_Loader)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"--set {key}: {shown(value)} is not a YAML value") from error
     for part in reversed(key.split(".")):
         nested = {part: nested}
     return nested
@@ -101,18 +133,26 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _update(settings: Any, mapping: Mapping[str, Any], source: str, prefix: str) -> None:
+def _update(settings: Any, mapping: Mapping[str, Any], source: str, prefix: str, say: Callable[[str], object]) -> None:
     hints = hints_of(type(settings))
+    given: dict[str, str] = {}
     for key, value in mapping.items():
         name = str(key).replace("-", "_")
+        now = settings.former.get(name) if isinstance(settings, Checked) else None
+        if now in hints:
+            say(f"{source}: {prefix}{name} is called {prefix}{now} now, and taken for it")
+            name = now
+        if name in given:
+            raise InputError(f"{source}: {prefix}{name} is stated twice, as {given[name]} and as {key}")
+        given[name] = str(key)
         if name not in hints:
             raise InputError(f"{source}: {_unknown(settings, name, prefix + str(key), prefix)}")
         current = getattr(settings, name)
         if _is_section(current):
             if not isinstance(value, Mapping):
-                raise InputError(f"{source}: {prefix}{name} is a section, expected keys and values, got {value!r}")
+                raise InputError(f"{source}: {prefix}{name} is a section, expected keys and values, got {shown(value)}")
             current = copy.copy(current)
-            _update(current, value, source, f"{prefix}{name}.")
+            _update(current, value, source, f"{prefix}{name}.", say)
             value = current
         else:
             value = coerce(value, hints[name], f"{source}: {prefix}{name}")
@@ -134,10 +174,8 @@ def _is_section(value: Any) -> bool:
 def _unknown(settings: Any, name: str, key: str, prefix: str) -> str:
     """What is wrong with a key that is no setting, and what it may have meant."""
     former = settings.former.get(name) if isinstance(settings, Checked) else None
-    if former is not None and " " in former:
-        return f"{key} is no longer a setting: {former}"
     if former is not None:
-        return f"{key} was renamed to {prefix}{former}"
+        return f"{key} is no longer a setting: {former}"
     known = list(hints_of(type(settings)))
     near = difflib.get_close_matches(name, known, n=1)
     inside = [
@@ -146,7 +184,7 @@ def _unknown(settings: Any, name: str, key: str, prefix: str) -> str:
         if _is_section(getattr(settings, part)) and hasattr(getattr(settings, part), name)
     ]
     meant = [*near, *inside]
-    return f"unknown key {key!r}" + (f"; did you mean {prefix + meant[0]!r}?" if meant else "")
+    return f"unknown key {shown(key)}" + (f"; did you mean {prefix + meant[0]!r}?" if meant else "")
 
 
 def run_settings(target: str | os.PathLike[str]) -> dict[str, Any]:

@@ -31,11 +31,14 @@ from nerfvol.config.values import (
     seconds,
     within,
 )
+from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:
     from nerfvol.region import SceneBounds
 
+MOST_THREADS = 1024
+"""More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
 FINEST_LEVEL = 16
 """Of a stage's leaves, where the numbers of octree.topology end."""
 Degree = Annotated[int, within(0, 3)]
@@ -321,8 +324,12 @@ class Config(Checked):
     file of splats (auto: what there is)."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
-    background: Colour = (1.0, 1.0, 1.0)
-    """Colour behind the scene, RGB in [0, 1]; images with alpha are composited on it."""
+    scene: Literal["auto", "object", "surroundings", "room", "forward"] = "auto"
+    """What kind of scene it is (datasets.kinds): an object before nothing or a plain backdrop, a subject with its
+    surroundings, a room seen from inside, or photographs that all look one way. auto: by what the pictures and cameras say."""
+    background: Colour | None = None
+    """Colour behind the scene, RGB in [0, 1]; images with alpha are composited on it. None: white, or the colour of the
+    plain backdrop that the photographs show."""
     downscale: Count = 1
     """Images are area-averaged by this whole factor."""
     aabb: Annotated[tuple[float, float, float, float, float, float] | None, box] = None
@@ -330,9 +337,9 @@ class Config(Checked):
     holdout: Literal["own", "arc"] = "own"
     """Views that are scored and not trained on. own: the data's, or every 8th; arc: neighbours among the training views, which
     says more of views between and beside the photographs."""
-    threads: Annotated[int, at_least(0)] = 0
+    threads: Annotated[int, within(0, MOST_THREADS)] = 0
     """CPU threads; 0: all cores this process may use."""
-    seed: int = 0
+    seed: Annotated[int, within(0, 2**63 - 1)] = 0
     """Of every random choice."""
     resume: bool = False
     """Go on from RUN's checkpoint."""
@@ -374,3 +381,10 @@ class Config(Checked):
             named = "octree" if self.init in OCTREE_STARTS else "auto" if self.init == "auto" else "splats"
             chosen = ("splats" if scene.is_unbounded else "octree") if named == "auto" else named
         return dataclasses.replace(self, **sections, representation=chosen)
+
+    def before(self, backdrop: tuple[float, float, float] | None) -> Config:
+        """The same with a background: as given, else ``backdrop``, the colour that the pictures have behind, else white.
+
+        Where opaque pictures have a backdrop, it is what is behind them, whatever is asked for.
+        """
+        return dataclasses.replace(self, background=backdrop or self.background or WHITE)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
@@ -23,14 +23,14 @@ def seconds(value: Any) -> Any:
     """A duration in seconds from 120, "120", "120s", "5m", "1.5h"; "none" and None mean no limit. ValueError for others."""
     if value is None or isinstance(value, str) and value.strip().lower() in ("none", "null", ""):
         return None
-    text = str(value).strip().lower()
-    number, unit = (text[:-1], text[-1]) if text[-1:] in _UNITS else (text, "s")
     try:
+        text = str(value).strip().lower() if isinstance(value, (str, int, float)) else ""
+        number, unit = (text[:-1], text[-1]) if text[-1:] in _UNITS else (text, "s")
         duration = float(number) * _UNITS[unit]
     except ValueError:
         duration = math.nan
     if not (math.isfinite(duration) and duration > 0):
-        raise ValueError(f"expected a duration such as 120s, 5m or 1h, got {value!r}")
+        raise ValueError(f"expected a duration such as 120s, 5m or 1h, got {shown(value)}")
     return duration
 
 
@@ -44,10 +44,10 @@ def colour(value: Any) -> Any:
         return _COLOURS[value.strip().lower()]
     try:
         components = tuple(float(part) for part in parts)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         components = ()
     if len(components) != 3 or not all(0.0 <= component <= 1.0 for component in components):
-        raise ValueError(f"expected white, black or R,G,B with numbers from 0 to 1, got {value!r}")
+        raise ValueError(f"expected white, black or R,G,B with numbers from 0 to 1, got {shown(value)}")
     return components
 
 
@@ -68,7 +68,7 @@ class Interval:
     def check(self, value: float) -> None:
         """A ValueError where ``value`` lies outside."""
         if not self.low <= value <= self.high or self.open and value == self.low:
-            raise ValueError(f"expected a number {self}, got {value!r}")
+            raise ValueError(f"expected a number {self}, got {shown(value)}")
 
     def __str__(self) -> str:
         low, high = f"{self.low:.12g}", f"{self.high:.12g}"
@@ -138,7 +138,7 @@ def _coerce(value: Any, hint: Any) -> Any:
         return value
     if origin is Literal:
         if value not in arguments or isinstance(value, bool) and not any(value is choice for choice in arguments):
-            raise ValueError(f"expected {' or '.join(map(str, arguments))}, got {value!r}")
+            raise ValueError(f"expected {' or '.join(map(str, arguments))}, got {shown(value)}")
         return value
     if origin in (typing.Union, types.UnionType):
         return _coerce_union(value, arguments)
@@ -146,10 +146,10 @@ def _coerce(value: Any, hint: Any) -> Any:
         return _coerce_sequence(value, origin, arguments)
     if origin is dict:
         if not isinstance(value, Mapping):
-            raise ValueError(f"expected keys and values, got {value!r}")
+            raise ValueError(f"expected keys and values, got {shown(value)}")
         return {_coerce(key, arguments[0]): _coerce(item, arguments[1]) for key, item in value.items()}
     if dataclasses.is_dataclass(hint) and isinstance(hint, type) and not isinstance(value, hint):
-        raise ValueError(f"expected {hint.__name__}(...), got {value!r}")
+        raise ValueError(f"expected {hint.__name__}(...), got {shown(value)}")
     return _SCALARS[hint](value) if hint in _SCALARS else value
 
 
@@ -157,8 +157,8 @@ class Checked:
     """A dataclass of settings whose values are checked by their annotations however it is made: from a file, the command
     line or a call. ``section`` is its place among the settings ("octree"; "" at the top).
 
-    former: settings that are no more, by name: the present name of the same thing, or a reason with a blank in it ("it is
-    always 8") where there is none. Using one is refused in a sentence that says so.
+    former: settings that are no more, by name: the present name of the same thing, which is then set, with a sentence; or a
+    reason with a blank in it ("it is always 8") where there is none, with which the setting is refused.
     """
 
     section: ClassVar[str] = ""
@@ -221,10 +221,10 @@ def _coerce_sequence(value: Any, kind: type, arguments: tuple[Any, ...]) -> Any:
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",")]
     if not isinstance(value, (list, tuple)):
-        raise ValueError(f"expected a list, got {value!r}")
+        raise ValueError(f"expected a list, got {shown(value)}")
     if kind is tuple and not (len(arguments) == 2 and arguments[1] is Ellipsis):
         if len(value) != len(arguments):
-            raise ValueError(f"expected a list of {len(arguments)}, got {len(value)}: {value!r}")
+            raise ValueError(f"expected a list of {len(arguments)}, got {len(value)}: {shown(value)}")
         return tuple(_coerce(item, hint) for item, hint in zip(value, arguments, strict=True))
     return kind(_coerce(item, arguments[0]) for item in value)
 
@@ -234,32 +234,32 @@ def _boolean(value: Any) -> bool:
     if isinstance(value, str) and value.strip().lower() in words:
         return words[value.strip().lower()]
     if not isinstance(value, bool):
-        raise ValueError(f"expected true or false, got {value!r}")
+        raise ValueError(f"expected true or false, got {shown(value)}")
     return value
 
 
 def _integer(value: Any) -> int:
     number = _number(value, "a whole number")
     if number != int(number):
-        raise ValueError(f"expected a whole number, got {value!r}")
+        raise ValueError(f"expected a whole number, got {shown(value)}")
     return int(value) if isinstance(value, (int, str)) and str(value).strip().lstrip("+-").isdigit() else int(number)
 
 
 def _number(value: Any, expected: str = "a number") -> float:
     if not isinstance(value, (int, float, str)) or isinstance(value, bool):
-        raise ValueError(f"expected {expected}, got {value!r}")
+        raise ValueError(f"expected {expected}, got {shown(value)}")
     try:
         number = float(value)
     except (ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"expected {expected}, got {value!r}")
+        raise ValueError(f"expected {expected}, got {shown(value)}")
     return number
 
 
 def _string(value: Any) -> str:
     if not isinstance(value, (str, Path)):
-        raise ValueError(f"expected text, got {value!r}")
+        raise ValueError(f"expected text, got {shown(value)}")
     return str(value)
 
 
@@ -280,35 +280,35 @@ def image_size(value: Any) -> Any:
     parts = value.lower().replace("×", "x").split("x") if isinstance(value, str) else value
     try:
         size = tuple(int(part) for part in parts)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         size = ()
     if len(size) != 2 or not all(1 <= side <= 16384 for side in size):
-        raise ValueError(f"expected a size such as 800x600 (1 to 16384 pixels a side), got {value!r}")
+        raise ValueError(f"expected a size such as 800x600 (1 to 16384 pixels a side), got {shown(value)}")
     return size
 
 
 def aov_names(value: Any) -> Any:
     """Names of extra pictures, of those in AOVS, from "depth,normal" or a list; ValueError for another name."""
     names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
-    for name in names:
+    for name in names if isinstance(names, (list, tuple)) else (names,):
         if name not in AOVS:
-            raise ValueError(f"expected names out of {', '.join(AOVS)}, got {name!r}")
+            raise ValueError(f"expected names out of {', '.join(AOVS)}, got {shown(name)}")
     return tuple(names)
 
 
 def fraction(value: Any) -> Any:
     """A number in [0, 1); ValueError for another."""
-    number = float(value)
+    number = _number(value)
     if not 0.0 <= number < 1.0:
-        raise ValueError(f"expected a number from 0 (exact) to below 1, got {value!r}")
+        raise ValueError(f"expected a number from 0 (exact) to below 1, got {shown(value)}")
     return number
 
 
 def pixels(value: Any) -> Any:
     """A finite number >= 0; ValueError for another."""
-    number = float(value)
+    number = _number(value)
     if not 0.0 <= number < math.inf:
-        raise ValueError(f"expected a number of pixels, 0 (off) or more, got {value!r}")
+        raise ValueError(f"expected a number of pixels, 0 (off) or more, got {shown(value)}")
     return number
 
 
@@ -322,12 +322,12 @@ def box(value: Any) -> Any:
     parts = value.split(",") if isinstance(value, str) else value
     try:
         numbers = tuple(float(part) for part in parts)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = ()
     low, high = numbers[:3], numbers[3:]
     if len(numbers) != 6 or not all(a < b and math.isfinite(b - a) for a, b in zip(low, high, strict=True)):
         raise ValueError(
-            f"expected x0,y0,z0,x1,y1,z1 with the first corner below the second on each axis, got {value!r}"
+            f"expected x0,y0,z0,x1,y1,z1 with the first corner below the second on each axis, got {shown(value)}"
         )
     return numbers
 

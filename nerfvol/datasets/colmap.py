@@ -1,4 +1,4 @@
-"""COLMAP models: cameras, images and points, binary or text, as written by COLMAP into ``sparse/0``.
+"""COLMAP models: cameras, images and points, binary or text, as written by COLMAP into ``sparse/0``, ``sparse/1``, ...
 
 Poses are world-to-camera in OpenCV axes (x right, y down, z forward), a unit quaternion (w, x, y, z) and a translation;
 the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
@@ -7,6 +7,7 @@ the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,20 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import FARTHEST, rigid_pose
 from nerfvol.cameras.lens import BrownConrady
-from nerfvol.datasets.colmap_files import images_file, points_file, read_cameras, read_images, read_points
-from nerfvol.datasets.listing import Frame, ImageFinder, Listing, hold_out
+from nerfvol.datasets.colmap_files import (
+    count_images,
+    images_file,
+    points_file,
+    read_cameras,
+    read_images,
+    read_points,
+)
+from nerfvol.datasets.listing import Frame, ImageFinder, Listing, MaskFinder, Poses, hold_out, is_photograph, named
 from nerfvol.datasets.llff import image_folder
 from nerfvol.datasets.points import ModelPoints
 from nerfvol.errors import InputError
 
-_PLACES = ("sparse/0", "colmap/sparse/0", "sparse", ".")
+_PLACES = ("sparse", "colmap/sparse", "distorted/sparse", ".")
 _MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
 _AROUND = 1.25  # a lens's distortion may move a point by so much from where a pinhole would show it
 _FITTING = (
@@ -28,53 +36,103 @@ _FITTING = (
 )
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder with cameras.bin and images.bin (or .txt), or None."""
+def find_models(folder: Path) -> list[Path]:
+    """The folders with cameras.bin and images.bin (or .txt) where COLMAP and its users put them, in order of their names."""
+    found = []
     for place in _PLACES:
-        for suffix in (".bin", ".txt"):
-            if all((folder / place / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")):
-                return folder / place
-    return None
+        inside = folder / place
+        try:
+            below = sorted(entry for entry in inside.iterdir() if entry.is_dir()) if place != "." else []
+        except OSError:
+            continue
+        below.sort(key=lambda entry: (not entry.name.isdigit(), int(entry.name) if entry.name.isdecimal() else 0))
+        found += [entry for entry in (*below, inside) if _is_model(entry)]
+    return found
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        all((folder / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")) for suffix in (".bin", ".txt")
+    )
 
 
 def recognises(path: Path) -> bool:
     """Whether the folder holds a COLMAP model."""
-    return find_model(path) is not None
+    return bool(find_models(path))
+
+
+def _largest(folder: Path, models: list[Path]) -> tuple[Path, list[str]]:
+    """The model with the most images, for the mapper numbers them in the order it begins them; and a sentence on others."""
+    counts = {}
+    for model in models:
+        try:
+            counts[model] = count_images(model)
+        except InputError:
+            if len(models) == 1:
+                raise
+            counts[model] = -1  # damaged: another may do
+    best = max(models, key=lambda model: counts[model])
+    if len(models) == 1:
+        return best, []
+    others = named([f"{model.relative_to(folder)} ({max(counts[model], 0)})" for model in models if model != best])
+    return best, [
+        f"{len(models)} COLMAP models: {best.relative_to(folder)} with {counts[best]} images is used, not {others}"
+    ]
 
 
 def read(folder: Path, split: str) -> Listing:
-    """The listing of one split: every 8th view by name is held out. The largest copy of the photographs is taken.
+    """The listing of one split: every 8th view by name is held out. The largest model and copy of the photographs are taken.
 
     Raises:
         InputError: there is no model, it is damaged or holds no images, or a pose or camera cannot be used.
     """
-    model = find_model(folder)
-    if model is None:
+    models = find_models(folder)
+    if not models:
         raise InputError(f"{folder}: expected a COLMAP model in sparse/0, but found none")
+    model, messages = _largest(folder, models)
     source, calibrations = images_file(model), read_cameras(model)
-    finder = ImageFinder(image_folder(folder))
+    if source.suffix == ".bin" and (model / "images.txt").is_file():
+        messages.append(f"{model.relative_to(folder)} holds a model as text too, which is not read")
+    photographs = image_folder(folder)
+    finder, masks, poses = ImageFinder(photographs), MaskFinder(folder, photographs), Poses(source)
     frames, numbers = [], []
     for number, name, quaternion, translation, camera in read_images(model):
         if camera not in calibrations:
             raise InputError(f"{source}, image {name}: its camera {camera} is not in the model's cameras")
         try:
-            frames.append(Frame(name, finder.find(name), _pose(quaternion, translation), calibrations[camera]))
-            numbers.append(number)
+            c2w = poses.read(name, _pose(quaternion, translation))
         except InputError as error:
             raise InputError(f"{source}, image {name}: {error}") from None
+        if c2w is not None:
+            path = finder.find(name)
+            frames.append(Frame(name, path, c2w, calibrations[camera], masks.of(name, path)))
+            numbers.append(number)
+    messages += poses.messages()
     if not frames:
         raise InputError(f"{source}: the model holds no images")
     present = [frame for frame in frames if frame.path is not None]
     missing = [frame for frame in frames if frame.path is None]
     if not present:
         return Listing(frames, frames, source)
+    messages += masks.messages(present) + _in_no_model(photographs, frames)
     chosen, training, sentence = hold_out(present, split)
     path = points_file(model)
-    listing = Listing(chosen + missing, training, source, messages=[sentence])
+    listing = Listing(chosen + missing, training, source, messages=[*messages, sentence])
     if path is not None:
         listing.messages += _doubt(path, dict(zip(numbers, frames, strict=True)))
         listing.read_points = lambda: model_points(path)
     return listing
+
+
+def _in_no_model(photographs: Path, frames: Sequence[Frame]) -> list[str]:
+    """A sentence on photographs of the folder that the model does not have."""
+    known = {frame.path for frame in frames}
+    folders = {frame.path.parent for frame in frames if frame.path is not None} | {photographs}
+    everything = {entry for folder in folders for entry in folder.iterdir() if is_photograph(entry) and entry.is_file()}
+    left = sorted(entry.name for entry in everything - known)
+    if not left:
+        return []
+    return [f"{len(left)} of {len(everything)} photographs are not in the model, and are left out: {named(left)}"]
 
 
 def model_points(path: Path) -> ModelPoints:
@@ -123,9 +181,11 @@ def _doubt(path: Path, frames: dict[int, Frame]) -> list[str]:
 
 
 def _pose(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera-to-world (4, 4) in OpenGL axes."""
+    """Camera-to-world (4, 4) in OpenGL axes; NaN where the file's numbers are not finite."""
+    if not (np.isfinite(translation).all() and np.isfinite(quaternion).all()):
+        return np.full((4, 4), np.nan)
     length = np.linalg.norm(quaternion) if (np.abs(quaternion) < 2).all() else np.inf
-    if not np.isfinite(translation).all() or not abs(length - 1) <= 0.1:
+    if not abs(length - 1) <= 0.1:
         numbers = " ".join(f"{v:g}" for v in (*quaternion, *translation))
         raise InputError(f"a pose must be a unit quaternion and a finite translation, got {numbers}")
     w, x, y, z = quaternion / length  # COLMAP itself normalises on reading: other tools write lengths like 1.01

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError
-from nerfvol.files.atomic import read_bytes
+from nerfvol.files.atomic import read_bytes, read_text
 
 # COLMAP's model ids, the lens they are, their parameters in its order; f stands for both focal lengths. What the lens has no
 # coefficient for must be zero.
@@ -188,18 +188,46 @@ def _images_binary(path: Path) -> Iterator[ImageRecord]:
 
 
 def _images_text(path: Path) -> Iterator[ImageRecord]:
-    for line in list(_lines(path))[::2]:  # every second line lists the features of the image above it
-        if not line:
+    """An image is a line, and below it its features, which many scripts and editors leave out where there are none."""
+    below = False
+    for line in _lines(path):
+        if below and _is_features(line):
+            below = False
             continue
-        try:
-            number, *numbers, camera, name = line.split(maxsplit=9)
-            values = [float(v) for v in numbers]
-            if len(values) != 7:
-                raise ValueError
-            yield ImageRecord(int(number), name, np.array(values[:4]), np.array(values[4:]), int(camera))
-        except ValueError:
-            fields = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-            raise InputError(f"{path}: expected {fields}, got {line!r:.60}") from None
+        below = bool(line)
+        if line:
+            yield _image_of(path, line)
+
+
+def _is_features(line: str) -> bool:
+    """Whether a line below an image lists its features: nothing, or triples of numbers, the third a whole one."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(map(np.isfinite, map(float, words))) and all(map(_is_whole, words[2::3]))
+    except ValueError:
+        return False
+
+
+def _is_whole(word: str) -> bool:
+    return word.lstrip("+-").isdigit()
+
+
+def _image_of(path: Path, line: str) -> ImageRecord:
+    try:
+        number, *numbers, camera, name = line.split(maxsplit=9)
+        values = [float(v) for v in numbers]
+        if len(values) != 7:
+            raise ValueError
+        return ImageRecord(int(number), name, np.array(values[:4]), np.array(values[4:]), int(camera))
+    except ValueError:
+        fields = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+        raise InputError(f"{path}: expected {fields}, got {line!r:.60}") from None
+
+
+def count_images(model: Path) -> int:
+    """How many images a model says it has; InputError where its file is damaged."""
+    path = images_file(model)
+    return _Cursor(path).take("Q")[0] if path.suffix == ".bin" else sum(1 for _ in _images_text(path))
 
 
 def _points_binary(path: Path) -> Iterator[PointRecord]:
@@ -226,7 +254,7 @@ def _points_text(path: Path) -> Iterator[PointRecord]:
 def _lines(path: Path) -> Iterator[str]:
     """The lines without comments. Empty ones stay: an image without features has an empty second line."""
     try:
-        text = read_bytes(path).decode("utf-8")
+        text = read_text(path)
     except UnicodeDecodeError:
         raise InputError(f"{path}: expected the text of a COLMAP model, got bytes that are no text") from None
     return (line.strip() for line in text.splitlines() if not line.startswith("#"))

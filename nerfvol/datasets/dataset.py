@@ -5,17 +5,20 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads
+from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads, mask_average, masked_average
 from nerfvol.datasets.points import ModelPoints
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
+
+if TYPE_CHECKING:
+    from nerfvol.datasets.frame import Frame
 
 Made = TypeVar("Made")
 
@@ -32,6 +35,9 @@ class Dataset:
     ``names``: one a view, unique, fit for a file name. ``source``: the file the poses came from.
     ``messages``: sentences a person should see (frames left out, how the split was made, how the bounds were found).
     ``threads``: that decode and average; one for every core by default. ``read_points``: see :attr:`points`.
+    ``masks``: uint8 (h, w) a view, 255 where its pixels count, 0 where they are not to be looked at, between where averaging
+    mixed both; None for a view that counts whole, and for all of them.
+    ``backdrop``: the RGB in [0, 1] that opaque pictures of an object have behind it. ``kind``: one of kinds.KINDS. ``frame``: the frame that cameras, bounds and points are in; None: scene units.
 
     dataclasses.replace makes a dataset of other cameras, images, bounds; what is not replaced is shared, the store of images
     too.
@@ -45,6 +51,10 @@ class Dataset:
     messages: list[str] = field(default_factory=list)
     threads: int | None = None
     read_points: Callable[[], ModelPoints] | None = None
+    masks: Sequence[UInt8 | None] | None = None
+    backdrop: tuple[float, float, float] | None = None
+    kind: str = ""
+    frame: Frame | None = None
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -52,7 +62,13 @@ class Dataset:
     @property
     def nbytes(self) -> int:
         """Bytes the images hold; 0 while they are released."""
-        return self.images.nbytes if isinstance(self.images, ImageStore) else sum(i.nbytes for i in self.images)
+        held = {id(mask): mask.nbytes for mask in self.masks or () if mask is not None}
+        images = self.images.nbytes if isinstance(self.images, ImageStore) else sum(i.nbytes for i in self.images)
+        return images + sum(held.values()) if images else 0
+
+    def mask(self, i: int) -> UInt8 | None:
+        """Which pixels of view i count, uint8 (h, w); None: all."""
+        return None if self.masks is None else self.masks[i]
 
     @property
     def can_reload(self) -> bool:
@@ -79,23 +95,26 @@ class Dataset:
             return self
         chosen = np.linspace(0, len(self) - 1, most).round().astype(int)
         cameras, images, names = ([column[i] for i in chosen] for column in (self.cameras, self.images, self.names))
-        return replace(self, cameras=cameras, images=images, names=names)
+        masks = None if self.masks is None else [self.masks[i] for i in chosen]
+        return replace(self, cameras=cameras, images=images, names=names, masks=masks)
 
     def smaller(self, k: int, background: Sequence[float]) -> Dataset:
         """All views area-averaged over k x k pixels, over a background (3,) in [0, 1]; InputError where nothing is left."""
         cameras = [camera.scaled(k) for camera in self.cameras]
-        return replace(self, cameras=cameras, images=self.pyramid(background, k))
+        return replace(self, cameras=cameras, images=self.pyramid(background, k), masks=self.weights(k))
 
     def middles(self, size: int) -> Dataset:
         """The middle of all views, at most size x size pixels of each; the images' memory is shared."""
-        cameras, images = [], []
-        for camera, image in zip(self.cameras, self.images, strict=True):
+        cameras, images, masks = [], [], []
+        for i, (camera, image) in enumerate(zip(self.cameras, self.images, strict=True)):
             top, left = (max(0, (full - size) // 2) for full in image.shape[:2])
             part = image[top : top + size, left : left + size]
             lens = camera.intrinsics.cropped(left, top, part.shape[1], part.shape[0])
             cameras.append(replace(camera, intrinsics=lens))
             images.append(part)
-        return replace(self, cameras=cameras, images=images)
+            mask = self.mask(i)
+            masks.append(None if mask is None else mask[top : top + size, left : left + size])
+        return replace(self, cameras=cameras, images=images, masks=None if self.masks is None else masks)
 
     def before_a_lens(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which points (n, 3) are right before a camera, (n,) bool: what is there is seen by no other and would only explain
@@ -133,6 +152,23 @@ class Dataset:
         """
         if not 1 <= k <= 256:
             raise InputError(f"the pyramid's factor must be an integer between 1 and 256, got {k}")
-        if then is None:
-            return map_threads(lambda image: composite_average(image, background, k), self.images, self.threads)
-        return map_threads(lambda image: then(composite_average(image, background, k)), self.images, self.threads)
+        keep = then or _itself
+
+        def make(i: int) -> Any:
+            mask = self.mask(i)
+            if mask is None or k == 1:
+                return keep(composite_average(self.images[i], background, k))
+            whole = composite_average(self.images[i], background, 1)
+            return keep(masked_average(whole, mask, k)[0])
+
+        return map_threads(make, range(len(self)), self.threads)
+
+    def weights(self, k: int) -> list[UInt8 | None] | None:
+        """How much each pixel of :meth:`pyramid` counts, uint8 (h // k, w // k) a view: 255 whole, 0 not; None for all."""
+        if self.masks is None:
+            return None
+        return [None if mask is None else mask if k == 1 else mask_average(mask, k) for mask in self.masks]
+
+
+def _itself(image: UInt8) -> UInt8:
+    return image

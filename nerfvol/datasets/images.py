@@ -6,10 +6,10 @@ colour premultiplied by alpha, summed exactly in integers and rounded once.
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections.abc import Callable, Iterable, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,7 +28,10 @@ Made = TypeVar("Made")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 MAX_PIXELS = 89_000_000  # a declared size beyond this is taken for a decompression bomb, as Pillow does
 _ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
-_DECODE_ERRORS = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error, MemoryError)
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+"""Whose decoders a file may reach."""
+_OR = "PNG, JPEG, WEBP, BMP or TIFF"
+_EXIF_ORIENTATION = 0x0112
 
 
 def map_threads(function: Callable[[Item], Made], items: Iterable[Item], threads: int | None = None) -> list[Made]:
@@ -40,57 +43,147 @@ def map_threads(function: Callable[[Item], Made], items: Iterable[Item], threads
         return list(pool.map(function, items))
 
 
-def _open(path: Path) -> Image.Image:
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The picture, opened but not decoded; whatever its decoder makes of it is one InputError that names the file.
+
+    Only the decoders of :data:`FORMATS` are tried: Pillow goes by the content, and among its others is one that starts
+    another program.
+    """
     try:
-        image = Image.open(path)
+        image = Image.open(path, formats=FORMATS)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise InputError(f"{path}: images of more than {MAX_PIXELS // 10**6} million pixels are refused") from error
     except FileNotFoundError as error:
         raise InputError(f"{path}: expected an image, but there is no such file") from error
     except UnidentifiedImageError as error:
-        raise InputError(f"{path}: expected a PNG or JPEG image, but its content is none") from error
+        raise InputError(f"{path}: expected a {_OR} image, but its content is {_looks_like(path)}") from error
     except OSError as error:
         raise InputError(f"{path}: the image cannot be read: {explain_os_error(error)}") from error
-    except _DECODE_ERRORS as error:
-        raise InputError(f"{path}: the image is damaged ({error})") from error
-    if image.width * image.height > MAX_PIXELS:
-        image.close()
-        raise InputError(
-            f"{path}: images of more than {MAX_PIXELS // 10**6} million pixels are refused, this one declares "
-            f"{image.width}x{image.height}"
-        )
-    return image
+    except Exception as error:  # decoders raise whatever damaged bytes bring them to
+        raise InputError(f"{path}: the image is damaged ({_first_line(error)})") from error
+    with image:
+        if image.width * image.height > MAX_PIXELS:
+            raise InputError(
+                f"{path}: images of more than {MAX_PIXELS // 10**6} million pixels are refused, this one declares "
+                f"{image.width}x{image.height}"
+            )
+        try:
+            yield image
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{path}: the image is damaged or truncated ({_first_line(error)})") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0][:80] or type(error).__name__
+
+
+def _looks_like(path: Path) -> str:
+    """What a file that is no known picture begins like."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError:
+        return "none"
+    if start[4:8] == b"ftyp":
+        return "HEIC or a video, as phones write them: convert it to JPEG"
+    names = {b"%!PS": "PostScript", b"\xc5\xd0\xd3\xc6": "PostScript", b"DDS ": "DDS", b"GIF8": "GIF", b"%PDF": "PDF",
+             b"8BPS": "a Photoshop document", b"\x00\x05\x16\x07": "what macOS leaves next to a file on foreign disks",
+             b"vers": "a Git LFS pointer: fetch the file itself"}  # fmt: skip
+    return next((name for magic, name in names.items() if start.startswith(magic)), "none")
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """``size``: (width, height) in pixels as stored. ``orientation``: EXIF's, 1 to 8; 1: as stored."""
+
+    size: tuple[int, int]
+    orientation: int
+
+    @property
+    def upright(self) -> tuple[int, int]:
+        """(width, height) once the picture is turned as its EXIF orientation says."""
+        return self.size[::-1] if self.orientation >= 5 else self.size
+
+
+def image_header(path: Path) -> ImageHeader:
+    """What the file's header says, without decoding; InputError where it is no image, damaged or too large."""
+    with _opened(path) as image:
+        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+        known = type(orientation) is int and 1 <= orientation <= 8
+        return ImageHeader(image.size, orientation if known else 1)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels from the file's header alone; InputError where it is no image, damaged or too large."""
-    with _open(path) as image:
-        return image.size
+    """(width, height) in pixels as stored, from the file's header alone; see :func:`image_header`."""
+    return image_header(path).size
 
 
-def read_image(path: Path) -> UInt8:
+def turned(image: UInt8, orientation: int) -> UInt8:
+    """The picture (h, w, ...) as EXIF's ``orientation`` means it to be seen, 1 to 8."""
+    if orientation in (5, 6, 7, 8):
+        image = image.swapaxes(0, 1)
+    rows, columns = {2: (1, -1), 3: (-1, -1), 4: (-1, 1), 6: (1, -1), 7: (-1, -1), 8: (-1, 1)}.get(orientation, (1, 1))
+    return np.ascontiguousarray(image[::rows, ::columns])
+
+
+def read_image(path: Path, orientation: int = 1) -> UInt8:
     """The image as uint8: (h, w, 4) where the file has transparency, else (h, w, 3); grey and palettes are expanded.
 
-    16-bit channels are reduced to 8. EXIF orientation is not applied: poses refer to pixels as stored.
+    16-bit channels are reduced to 8. ``orientation``: how to turn it, as EXIF numbers it; by default pixels stay as stored,
+    which is what most poses refer to.
 
     Raises:
         InputError: there is no such image, it is damaged, has 32 bits a channel or more than MAX_PIXELS.
     """
-    with _open(path) as image:
-        try:
-            if image.mode.startswith("I;16"):
-                grey = (np.asarray(image).astype(np.uint32) + 128) // 257
-                return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
-            if image.mode in ("I", "F"):
-                raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32-bit pixels (mode {image.mode})")
-            has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
-            wanted = "RGBA" if has_alpha else "RGB"
-            converted = image if image.mode == wanted else image.convert(wanted)
-            return np.array(converted)
-        except InputError:
-            raise
-        except _DECODE_ERRORS as error:
-            raise InputError(f"{path}: the image is damaged or truncated ({error})") from error
+    with _opened(path) as image:
+        return turned(_pixels(image, path), orientation)
+
+
+def read_small(path: Path, size: int) -> UInt8:
+    """As :func:`read_image`, reduced by a whole factor so that about ``size`` pixels are left along it: to look at."""
+    with _opened(path) as image:
+        factor = max(1, min(image.size) // size)
+        image.draft(None, (image.width // factor, image.height // factor))  # JPEG alone can; others ignore it
+        pixels = _pixels(image, path)
+    return area_average(pixels, max(1, min(pixels.shape[:2]) // size))
+
+
+def read_mask(path: Path, size: tuple[int, int], orientation: int = 1) -> UInt8:
+    """A mask (h, w) uint8, 0 or 255, for a picture of ``size`` (width, height): 255 where the file is not black.
+
+    A uniformly smaller or larger mask is resized to the nearest pixel. Where the file has transparency and no colour, that
+    counts.
+
+    Raises:
+        InputError: as for read_image, or a mask of another shape.
+    """
+    with _opened(path) as image:
+        pixels, darkest = _pixels(image, path), 127 if image.format == "JPEG" else 0  # JPEG's black is a little noisy
+    values = pixels[..., :3].max(axis=2)
+    if pixels.shape[2] == 4:
+        values = pixels[..., 3] if values.min() == values.max() else np.minimum(values, pixels[..., 3])
+    mask = turned(np.where(values > darkest, 255, 0).astype(np.uint8), orientation)
+    height, width = mask.shape
+    if (width, height) == size:
+        return mask
+    if abs(width / size[0] - height / size[1]) * min(size) > 2 + 2 * width / size[0]:
+        raise InputError(f"{path}: expected a mask of {size[0]}x{size[1]} pixels like its image, got {width}x{height}")
+    rows, columns = ((np.arange(n) + 0.5) * have / n for n, have in ((size[1], height), (size[0], width)))
+    return np.ascontiguousarray(mask[rows.astype(int)[:, None], columns.astype(int)])
+
+
+def _pixels(image: Image.Image, path: Path) -> UInt8:
+    if image.mode.startswith("I;16"):
+        grey = (np.asarray(image).astype(np.uint32) + 128) // 257
+        return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+    if image.mode in ("I", "F"):
+        raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32-bit pixels (mode {image.mode})")
+    has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
+    wanted = "RGBA" if has_alpha else "RGB"
+    return np.array(image if image.mode == wanted else image.convert(wanted))
 
 
 def _area_sums(plane: NDArray[np.unsignedinteger], k: int) -> NDArray[np.uint32]:
@@ -153,6 +246,25 @@ def composite_average(image: UInt8, background: Sequence[float], k: int) -> UInt
             mixed += behind
             np.right_shift(mixed, 8, out=out[..., c], casting="unsafe")  # round(mixed / 255), exact in 16 bits
     return out
+
+
+def masked_average(image: UInt8, mask: UInt8, k: int) -> tuple[UInt8, UInt8]:
+    """The image (h, w, 3 or 4) and its mask (h, w), area-averaged by k: colours of the part that is not masked alone.
+
+    What is masked, black things and people, must not colour what is averaged with it. A block that is masked as a whole is
+    black, and its mask 0.
+    """
+    if k == 1:
+        return image, mask
+    if image.shape[2] == 3:
+        both = area_average(np.concatenate([image, mask[..., None]], axis=2), k)
+        return np.ascontiguousarray(both[..., :3]), np.ascontiguousarray(both[..., 3])
+    return area_average(image, k), mask_average(mask, k)
+
+
+def mask_average(mask: UInt8, k: int) -> UInt8:
+    """A mask (h, w) averaged by k: (h // k, w // k)."""
+    return mask if k == 1 else _divide(_area_sums(mask, k), np.uint32(k * k))
 
 
 def composite(image: UInt8, background: Sequence[float]) -> NDArray[np.float32]:

@@ -10,22 +10,95 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.camera import unscaled_pose
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.images import SUFFIXES
 from nerfvol.datasets.points import ModelPoints
 from nerfvol.errors import InputError
 
 HOLD_OUT_EVERY = 8
+MOST_LOST = 0.5
+"""Share of the frames that may lack a usable pose; a set that loses more is refused."""
+
+
+def named(names: Sequence[str], most: int = 3) -> str:
+    """The first few of ``names`` for a sentence."""
+    return ", ".join(str(name) for name in names[:most]) + (", ..." if len(names) > most else "")
+
+
+class Poses:
+    """Poses as files have them, frame by frame: those of no use are left out, and all that was done is told once.
+
+    ``where``: the file, for sentences.
+    """
+
+    def __init__(self, where: Path) -> None:
+        self.where = where
+        self.lost: list[str] = []
+        self.scaled: dict[str, float] = {}
+        self.count = 0
+
+    def read(self, listed: str, matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """The rigid pose (4, 4) of the frame ``listed``; None where its matrix is not finite, as trackers write that they
+        lost it.
+
+        Raises:
+            InputError: see rigid_pose.
+        """
+        self.count += 1
+        if matrix.shape in ((3, 4), (4, 4)) and not np.isfinite(matrix).all():
+            self.lost.append(listed)
+            return None
+        pose, scale = unscaled_pose(matrix)
+        if scale != 1:
+            self.scaled[listed] = scale
+        return pose
+
+    def messages(self) -> list[str]:
+        """Sentences on what was left out or changed.
+
+        Raises:
+            InputError: more than half of the frames have no usable pose.
+        """
+        said = []
+        if len(self.lost) > MOST_LOST * self.count:
+            raise InputError(
+                f"{self.where}: the poses of {len(self.lost)} of {self.count} frames hold NaN or infinity instead of finite "
+                f"numbers ({named(self.lost)}), and too few are left"
+            )
+        if self.lost:
+            said.append(
+                f"{len(self.lost)} of {self.count} frames have no finite pose and are left out: {named(self.lost)}"
+            )
+        if self.scaled:
+            factors = list(self.scaled.values())
+            said.append(
+                f"the axes of {len(factors)} of {self.count} poses are not of unit length (scaled by "
+                f"{float(np.median(factors)):.3g}); that says nothing of the scene and was taken out"
+            )
+        return said
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """Which pixels of an image are not to be looked at. ``black_is_out``: the black ones; else those that are not black."""
+
+    path: Path
+    black_is_out: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One listed image: as named by the file, where it is on disk (None if missing), its pose and calibration."""
+    """One listed image: as named by the file, where it is on disk (None if missing), its pose and calibration.
+
+    ``masks``: files that say which of its pixels count; none by default.
+    """
 
     listed: str
     path: Path | None
     c2w: NDArray[np.float64]
     calibration: Calibration
+    masks: tuple[MaskFile, ...] = ()
 
     @property
     def file(self) -> Path:
@@ -66,6 +139,65 @@ def hold_out(frames: list[Frame], split: str) -> tuple[list[Frame], list[Frame],
     return (kept if split == "train" else held), kept, sentence
 
 
+class MaskFinder:
+    """Masks by the conventions of other programs: what a file names, ``dynamic_mask_NAME`` and folders of masks."""
+
+    def __init__(self, folder: Path, images: Path | None = None) -> None:
+        """``folder``: of the data set; ``images``: of the photographs, where masks folders may lie too."""
+        self._finder = ImageFinder(folder)
+        self._beside: dict[Path, ImageFinder] = {}
+        self._folders = [place for place in {folder / "masks", (images or folder) / "masks", (images or folder).parent / "masks"}
+                         if place.is_dir()]  # fmt: skip
+        self._images = images
+        self.stated = 0
+        self.missing: list[str] = []
+
+    def of(self, listed: str, path: Path | None, stated: str | None = None) -> tuple[MaskFile, ...]:
+        """The masks of the image ``listed`` at ``path``; ``stated``: what its file names as such."""
+        if path is None:
+            return ()
+        found = []
+        if stated is not None:
+            self.stated += 1
+            mask = self._finder.find(stated)
+            if mask is None:
+                self.missing.append(stated)
+            else:
+                found.append(MaskFile(mask))
+        beside = self._beside.setdefault(path.parent, ImageFinder(path.parent))
+        for name in (f"dynamic_mask_{path.name}", f"dynamic_mask_{path.stem}"):
+            if (mask := beside.find(name)) is not None:
+                found.append(MaskFile(mask, black_is_out=False))
+                break
+        if not found:
+            found += self._in_folders(listed, path)
+        return tuple(found)
+
+    def _in_folders(self, listed: str, path: Path) -> list[MaskFile]:
+        """COLMAP's: the image's name and .png, below a folder of masks; or the image's stem."""
+        for folder in self._folders:
+            finder = self._beside.setdefault(folder, ImageFinder(folder))
+            inside = listed.replace("\\", "/")
+            for name in (f"{inside}.png", f"{path.name}.png", inside, path.stem):
+                if path.parent != folder and (mask := finder.find(name)) is not None and mask != path:
+                    return [MaskFile(mask)]
+        return []
+
+    def messages(self, frames: Sequence[Frame]) -> list[str]:
+        """Sentences on the masks of ``frames``."""
+        with_mask = [frame.listed for frame in frames if frame.masks]
+        said = []
+        if with_mask:
+            said.append(
+                f"{len(with_mask)} of {len(frames)} images have masks: what those leave out takes no part in training and scores"
+            )
+        if self.missing:
+            said.append(
+                f"{len(self.missing)} masks that are named are not on disk, and their images count whole: {named(self.missing)}"
+            )
+        return said
+
+
 def listed_names(frames: Sequence[Frame]) -> list[str]:
     """One unique name a frame, fit for a file name: the image's stem, or its path with _ for / where stems repeat."""
     paths = [Path(frame.listed.replace("\\", "/")) for frame in frames]
@@ -77,6 +209,11 @@ def listed_names(frames: Sequence[Frame]) -> list[str]:
     return [f"{i:04d}_{name}" for i, name in enumerate(long)] if len(set(long)) < len(long) else long
 
 
+def is_photograph(path: Path) -> bool:
+    """Whether a file's name is a photograph's: a known suffix, and no leftover of an operating system (``._a.jpg``)."""
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith((".", "dynamic_mask_"))
+
+
 class ImageFinder:
     """Finds image files as formats name them: relative to a folder, with or without the suffix, in any case."""
 
@@ -85,8 +222,25 @@ class ImageFinder:
         self._listings: dict[Path, dict[str, Path]] = {}
 
     def find(self, listed: str) -> Path | None:
-        """The file, or None if there is none."""
-        path = self._folder / listed.replace("\\", "/")
+        """The file, or None if there is none.
+
+        A path that leads nowhere, absolute ones of another machine above all, is looked for by its last parts below the
+        folder.
+        """
+        try:
+            return self._find(self._folder / listed.replace("\\", "/")) or self._by_end(listed)
+        except (OSError, ValueError):  # a name too long, half a character
+            return None
+
+    def _by_end(self, listed: str) -> Path | None:
+        absolute = listed.startswith(("/", "\\")) or listed[1:3] in (":\\", ":/") or listed.startswith("..")
+        parts = [part for part in listed.replace("\\", "/").split("/") if part not in ("", ".", "..")]
+        for first in range(len(parts)) if absolute else ():
+            if (found := self._find(self._folder.joinpath(*parts[first:]))) is not None:
+                return found
+        return None
+
+    def _find(self, path: Path) -> Path | None:
         names = self._names(path.parent)
         if path.name in names or path.name.lower() in names:
             found = path if path.is_file() else names[path.name.lower()]
@@ -103,5 +257,5 @@ class ImageFinder:
                 entries = sorted(folder.iterdir())
             except OSError:  # a folder that is not there holds no images; the caller reports them as missing
                 entries = []
-            self._listings[folder] = {entry.name.lower(): entry for entry in entries}
+            self._listings[folder] = {e.name.lower(): e for e in entries if not e.name.startswith(".")}
         return self._listings[folder]

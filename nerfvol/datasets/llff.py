@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
-from nerfvol.cameras.camera import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
-from nerfvol.datasets.images import SUFFIXES
-from nerfvol.datasets.listing import Frame, Listing, hold_out
+from nerfvol.datasets.colmap_files import read_images
+from nerfvol.datasets.listing import Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
 from nerfvol.errors import InputError
 
 POSES = "poses_bounds.npy"
@@ -45,23 +44,53 @@ def read(folder: Path, split: str) -> Listing:
     path = folder / POSES
     rows = _load_rows(path)
     images = image_folder(folder)
-    names = sorted(entry.name for entry in images.iterdir() if entry.suffix.lower() in SUFFIXES)
+    names = sorted(entry.name for entry in images.iterdir() if is_photograph(entry))
+    poses, masks = Poses(path), MaskFinder(folder, images)
+    said = []
     if len(names) != len(rows):
-        raise InputError(f"{path}: holds {len(rows)} poses, but {images.name} holds {len(names)} images")
+        names, said = _registered(folder, images, names, len(rows))
     frames = []
     for name, row in zip(names, rows, strict=True):
         matrix = row[:15].reshape(3, 5)
         down, right, back, position = matrix[:, :4].T
         try:
-            c2w = rigid_pose(np.stack([right, -down, back, position], axis=1))
-            frames.append(Frame(name, images / name, c2w, _calibration(matrix[:, 4])))
+            c2w = poses.read(name, np.stack([right, -down, back, position], axis=1))
+            if c2w is not None:
+                frames.append(
+                    Frame(name, images / name, c2w, _calibration(matrix[:, 4]), masks.of(name, images / name))
+                )
         except InputError as error:
             raise InputError(f"{path}, image {name}: {error}") from None
+    said += poses.messages() + masks.messages(frames)
     chosen, training, sentence = hold_out(frames, split)
-    near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
+    depths = rows[np.isfinite(rows[:, 15:]).all(axis=1), 15:]
+    near, far = (float(depths[:, 0].min()), float(depths[:, 1].max())) if len(depths) else (np.nan, np.nan)
     if not 0 < near < far < 1e15:
         raise InputError(f"{path}: expected finite depths with 0 < near < far, got {near:g} and {far:g}")
-    return Listing(chosen, training, path, BoundsHint(near_far=(near, far)), [sentence])
+    return Listing(chosen, training, path, BoundsHint(near_far=(near, far)), [*said, sentence])
+
+
+def _registered(folder: Path, images: Path, names: list[str], count: int) -> tuple[list[str], list[str]]:
+    """The photographs that have poses, in order, by the COLMAP model that the poses were made from; and a sentence.
+
+    Raises:
+        InputError: there is no such model, or it does not have as many images as there are poses.
+    """
+    wrong = f"{folder / POSES}: holds {count} poses, but {images.name} holds {len(names)} images"
+    models = [folder / "sparse" / "0", folder / "sparse"]
+    model = next((m for m in models if any((m / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
+    if model is None:
+        raise InputError(
+            f"{wrong}, so that which pose is whose is not known; take out the images that structure from motion left out, or "
+            "keep the COLMAP model in sparse/0 next to them"
+        )
+    listed = sorted(record.name for record in read_images(model))
+    if len(listed) != count or not set(listed) <= set(names):
+        raise InputError(f"{wrong}, and the model in {model} lists {len(listed)}; convert it to poses again")
+    left = sorted(set(names) - set(listed))
+    return listed, [
+        f"{len(left)} images have no pose, as {model.relative_to(folder)} says, and are left out: {named(left)}"
+    ]
 
 
 def image_folder(folder: Path) -> Path:
@@ -79,8 +108,10 @@ def _load_rows(path: Path) -> NDArray[np.float64]:
         raise InputError(f"{path}: expected a numpy array of poses, but it cannot be read ({error})") from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise InputError(f"{path}: expected an array of shape (views, 17), got {getattr(rows, 'shape', type(rows))}")
-    if not np.issubdtype(rows.dtype, np.floating) or not np.isfinite(rows).all():
-        raise InputError(f"{path}: expected finite floating-point numbers, got {rows.dtype} with NaN or infinity")
+    if not np.issubdtype(rows.dtype, np.floating):
+        raise InputError(f"{path}: expected floating-point numbers, got {rows.dtype}")
+    if not np.isfinite(rows[:, [4, 9, 14]]).all():
+        raise InputError(f"{path}: expected finite sizes and focal lengths, got NaN or infinity")
     return rows.astype(np.float64)
 
 

@@ -11,16 +11,32 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.datasets.bounds import bounds_of_box, estimate_bounds, require_seen
+from nerfvol.cameras.focus import focus_point
+from nerfvol.datasets.bounds import bounds_of_box, bounds_of_points, estimate_bounds, require_seen
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.formats import SPLITS, find_format
+from nerfvol.datasets.frames import View, views_of, with_circles, with_common_masks
 from nerfvol.datasets.holdout import HOLDOUTS, hold_out_arc
-from nerfvol.datasets.images import UInt8, area_average, image_size, map_threads, read_image
-from nerfvol.datasets.listing import Frame, Listing, listed_names
+from nerfvol.datasets.images import (
+    UInt8,
+    area_average,
+    map_threads,
+    masked_average,
+    read_image,
+    read_small,
+    turned,
+)
+from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
+from nerfvol.datasets.listing import Frame, Listing, listed_names, named
 from nerfvol.datasets.store import ImageStore
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 from nerfvol.machine import total_memory
 from nerfvol.region import SceneBounds, check_box
+
+MOST_JUDGED = 24
+"""Training pictures that the kind of scene is judged by, ..."""
+JUDGED_SIZE = 128
+"""... at about so many pixels along the shorter side."""
 
 
 def load_dataset(
@@ -30,6 +46,7 @@ def load_dataset(
     aabb: ArrayLike | None = None,
     threads: int | None = None,
     holdout: str = "own",
+    scene: str = "auto",
 ) -> Dataset:
     """Loads one split of a folder of posed images, whatever its format (docs/data.md).
 
@@ -42,6 +59,7 @@ def load_dataset(
         threads: threads that decode; one for every core by default.
         holdout: "own": the split is the files', or every 8th view is held out; "arc": neighbours among the views that would
             then train are held out together, for validation and test alike, and the others train.
+        scene: what kind of scene it is, one of kinds.KINDS; "auto": by what pictures and cameras say.
 
     Raises:
         InputError: where the files cannot be used, in one sentence that names the file.
@@ -50,6 +68,8 @@ def load_dataset(
         raise InputError(f"the split must be one of {', '.join(SPLITS)}, got {split!r}")
     if not isinstance(downscale, int) or not 1 <= downscale <= 256:
         raise InputError(f"downscale must be an integer between 1 and 256, got {downscale!r}")
+    if scene not in ("auto", *KINDS):
+        raise InputError(f"the kind of scene must be auto or one of {', '.join(KINDS)}, got {shown(scene)}")
     box = None if aabb is None else check_box(aabb, "aabb")
     if holdout not in HOLDOUTS:
         raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
@@ -59,27 +79,106 @@ def load_dataset(
     )
     messages = list(listing.messages)
     frames = _present(listing, messages)
-    sizes = map_threads(lambda frame: image_size(frame.file), frames, threads)
-    _require_one_size(frames, sizes)
-    full_size = [_camera(frame, size, listing.source) for frame, size in zip(frames, sizes, strict=True)]
-    cameras = [camera.scaled(downscale) for camera in full_size]
-    _require_memory(cameras, downscale)
-
-    def decode() -> tuple[list[UInt8], bool]:
-        images = map_threads(lambda frame: area_average(read_image(frame.file), downscale), frames, threads)
-        for frame, image, camera in zip(frames, images, cameras, strict=True):
-            if image.shape[:2] != (camera.intrinsics.height, camera.intrinsics.width):
-                raise InputError(f"{frame.path}: the image is not of the size its header declares")
-        return _settle_alpha(images, listing.source)
-
-    images, has_alpha = decode()
     training = [f for f in listing.training if f.path is not None] or frames
-    scene, sentence = _bounds(listing, training, box, has_alpha)
-    require_seen(scene, cameras)
-    messages.append(sentence)
+    views, training_views = views_of(frames, training, listing.source, messages, threads)
+    cameras = [view.camera.scaled(downscale) for view in views]
+    _require_memory(cameras, downscale)
+    views = with_common_masks(views, training_views, messages)
+    judged = _sample(training_views, threads)
+    views, circles = with_circles(views, judged, messages)
+    judged = [(replace(view, circle=circles.get(view.camera.intrinsics)), picture) for view, picture in judged]
+    evidence = look([picture for _, picture in judged], [_seen_small(view, picture) for view, picture in judged])
+    bounds, decision, said = _scene_of(listing, training_views, box, evidence, scene)
+    messages += [*decision.doubts, decision.sentence, said]
+    # In photographs of a place what is transparent was not seen, by whatever cut it out.
+    cut_out = decision.kind != "object"
+
+    def decode() -> tuple[list[UInt8], list[UInt8 | None]]:
+        made = map_threads(lambda view: _decoded(view, downscale, cut_out), views, threads)
+        return _settle_alpha([image for image, _ in made], listing.source), [mask for _, mask in made]
+
+    images, masks = decode()
+    require_seen(bounds, cameras)
+    messages += _on_masks(views, masks, images)
     store = ImageStore(len(images), lambda: decode()[0], images)
-    names, source = listed_names(frames), str(listing.source)
-    return Dataset(cameras, store, names, scene, source, messages, threads, listing.read_points)
+    names, source = listed_names([view.frame for view in views]), str(listing.source)
+    backdrop = evidence.backdrop if decision.kind == "object" and not evidence.see_through else None
+    some = masks if any(mask is not None for mask in masks) else None
+    return Dataset(
+        cameras, store, names, bounds, source, messages, threads, listing.read_points, some, backdrop, decision.kind
+    )
+
+
+def _scene_of(
+    listing: Listing, training: Sequence[View], box: NDArray[np.float64] | None, evidence: Evidence, asked: str
+) -> tuple[SceneBounds, Decision, str]:
+    """The bounds, what they were taken for, and a sentence on how they were found."""
+    cameras, hint = [view.camera for view in training], listing.hint
+    decision = decide(asked, evidence, cameras, focus_point(cameras), hint.near_far is not None)
+    has_alpha, bounded = evidence.see_through, decision.kind == "object"
+    if box is not None:
+        return bounds_of_box(box, has_alpha, bounded), decision, "scene bounds: the aabb as given"
+    bounds, said = estimate_bounds(cameras, has_alpha, hint, decision.kind)
+    if bounds.is_guess and listing.read_points is not None:
+        points = listing.read_points()
+        good = points.positions[points.track_lengths >= 3]
+        if len(good) >= 100:
+            return bounds_of_points(good, bounds), decision, f"scene bounds: around the points of {points.source}"
+    return bounds, decision, said
+
+
+def _sample(views: Sequence[View], threads: int | None) -> list[tuple[View, UInt8]]:
+    """A few training views with their pictures, small: what the kind of scene is judged by."""
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, MOST_JUDGED).round().astype(int))]
+    pictures = map_threads(lambda view: turned(read_small(view.path, JUDGED_SIZE), view.orientation), chosen, threads)
+    return list(zip(chosen, pictures, strict=True))
+
+
+def _seen_small(view: View, picture: UInt8) -> NDArray[np.bool_] | None:
+    """Which pixels (h, w) of the view's small picture count; None: all."""
+    mask = view.seen()
+    if mask is None:
+        return None
+    rows, columns = (
+        ((np.arange(n) + 0.5) * have / n).astype(int) for n, have in zip(picture.shape[:2], mask.shape, strict=True)
+    )
+    return mask[rows[:, None], columns] > 127
+
+
+def _decoded(view: View, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
+    """A view's image and mask at its final size."""
+    image, mask = read_image(view.path, view.orientation), view.seen()
+    lens = view.camera.intrinsics
+    if image.shape[:2] != (lens.height, lens.width):
+        raise InputError(f"{view.path}: the image is not of the size its header declares")
+    if cut_out and image.shape[2] == 4:
+        unseen = image[..., 3] < 128
+        if unseen.any() and not unseen.all():
+            kept = np.where(unseen, 0, 255).astype(np.uint8)
+            mask = kept if mask is None else np.minimum(mask, kept)
+        image = np.ascontiguousarray(image[..., :3]) if not unseen.all() else image
+    if mask is None:
+        return area_average(image, downscale), None
+    return masked_average(image, mask, downscale)
+
+
+def _on_masks(views: Sequence[View], masks: Sequence[UInt8 | None], images: Sequence[UInt8]) -> list[str]:
+    """Sentences on what is left out of pictures; InputError where nothing is left of any."""
+    said = []
+    empty = [view.frame.listed for view, mask in zip(views, masks, strict=True) if mask is not None and not mask.any()]
+    if len(empty) == len(views):
+        raise InputError(f"{views[0].path}: the masks of all {len(views)} images leave nothing to look at")
+    if empty:
+        said.append(f"the masks of {len(empty)} images leave nothing of them: {named(empty)}")
+    by_alpha = [
+        view.frame.listed for view, mask in zip(views, masks, strict=True) if mask is not None and view.seen() is None
+    ]
+    if by_alpha:
+        said.append(
+            f"{len(by_alpha)} of {len(views)} photographs have transparent pixels: they count as not seen, and take no part in "
+            f"training and scores: {named(by_alpha)}"
+        )
+    return said
 
 
 def _without_arc(listing: Listing, split: str) -> Listing:
@@ -104,33 +203,10 @@ def _present(listing: Listing, messages: list[str]) -> list[Frame]:
             else f"{listing.source}: no images are left for this split"
         )
     if missing:
-        shown = ", ".join(missing[:3]) + (", ..." if len(missing) > 3 else "")
         messages.append(
-            f"{listing.source.name} lists {len(missing)} images that are not on disk; they are left out: {shown}"
+            f"{listing.source.name} lists {len(missing)} images that are not on disk; they are left out: {named(missing)}"
         )
     return present
-
-
-def _camera(frame: Frame, size: tuple[int, int], source: Path) -> Camera:
-    try:
-        camera = Camera(frame.calibration.intrinsics(*size), frame.c2w)
-        width, height = size
-        camera.intrinsics.directions_at([(0, 0), (width, 0), (0, height), (width, height)])  # refuses a lens that folds
-        return camera
-    except InputError as error:
-        raise InputError(f"{source}, frame {frame.listed}: {error}") from None
-
-
-def _require_one_size(frames: Sequence[Frame], sizes: Sequence[tuple[int, int]]) -> None:
-    """A field of view shared by images of unstated size means nothing unless they are of one size."""
-    first: tuple[Frame, tuple[int, int]] | None = None
-    for frame, size in zip(frames, sizes, strict=True):
-        if frame.calibration.width is not None or frame.calibration.fx is not None:
-            continue
-        first = first or (frame, size)
-        if size != first[1]:
-            expected = f"{first[1][0]}x{first[1][1]} pixels like {first[0].listed}"
-            raise InputError(f"{frame.path}: expected an image of {expected}, got {size[0]}x{size[1]}")
 
 
 def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
@@ -145,20 +221,11 @@ def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
         )
 
 
-def _settle_alpha(images: list[UInt8], source: Path) -> tuple[list[UInt8], bool]:
+def _settle_alpha(images: list[UInt8], source: Path) -> list[UInt8]:
     """Drops alpha channels where no image of the split uses one; refuses a split in which nothing is visible."""
     with_alpha = [image for image in images if image.shape[2] == 4]
     if len(with_alpha) == len(images) and not any(image[..., 3].any() for image in images):
         raise InputError(f"{source}: all {len(images)} images are fully transparent, so there is nothing to learn from")
     if any(image[..., 3].min() < 255 for image in with_alpha):
-        return images, True
-    return [np.ascontiguousarray(image[..., :3]) for image in images], False
-
-
-def _bounds(
-    listing: Listing, training: list[Frame], box: NDArray[np.float64] | None, has_alpha: bool
-) -> tuple[SceneBounds, str]:
-    if box is not None:
-        return bounds_of_box(box, has_alpha), "scene bounds: the aabb as given"
-    cameras = [_camera(frame, image_size(frame.file), listing.source) for frame in training]
-    return estimate_bounds(cameras, has_alpha, listing.hint)
+        return images
+    return [np.ascontiguousarray(image[..., :3]) for image in images]

@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
-from nerfvol.cameras.camera import rigid_pose
 from nerfvol.datasets.bounds import BoundsHint
-from nerfvol.datasets.images import SUFFIXES
-from nerfvol.datasets.listing import Frame, Listing, hold_out
+from nerfvol.datasets.listing import Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
 from nerfvol.errors import InputError
-from nerfvol.files.atomic import read_bytes
+from nerfvol.files.atomic import read_text
 from nerfvol.region import check_box
 
 INTRINSICS, BOX = "intrinsics.txt", "bbox.txt"
@@ -43,26 +41,31 @@ def read(folder: Path, split: str) -> Listing:
     hint = BoundsHint(aabb=_box(folder / BOX) if (folder / BOX).is_file() else None)
     frames: dict[str, list[Frame]] = {}
     everything = []
-    for image in sorted(p for p in (folder / _IMAGES).iterdir() if p.suffix.lower() in SUFFIXES):
-        frame = Frame(image.name, image, _pose(folder / _POSES / f"{image.stem}.txt"), calibration)
+    poses, masks = Poses(folder / _POSES), MaskFinder(folder, folder / _IMAGES)
+    for image in sorted(p for p in (folder / _IMAGES).iterdir() if is_photograph(p)):
+        c2w = _pose(poses, image.name, folder / _POSES / f"{image.stem}.txt")
+        if c2w is None:
+            continue
+        frame = Frame(image.name, image, c2w, calibration, masks.of(image.name, image))
         everything.append(frame)
         frames.setdefault(_PREFIXES.get(image.name[:2], ""), []).append(frame)
+    said = poses.messages() + masks.messages(everything) + _without_image(folder)
     if not everything:
         raise InputError(f"{folder / _IMAGES}: expected images, but there are none")
     if "" in frames or "train" not in frames or len(frames) == 1:
         chosen, training, sentence = hold_out(everything, split)
-        return Listing(chosen, training, source, hint, [sentence])
+        return Listing(chosen, training, source, hint, [*said, sentence])
     if split in frames:
-        return Listing(frames[split], frames["train"], source, hint)
+        return Listing(frames[split], frames["train"], source, hint, said)
     other = {"val": "test", "test": "val"}[split]
     message = f"no image is named for the {split} views: the {other} views are used instead"
-    return Listing(frames[other], frames["train"], source, hint, [message])
+    return Listing(frames[other], frames["train"], source, hint, [*said, message])
 
 
 def _rows(path: Path) -> list[list[float]]:
     """The numbers of a text file, line by line; empty lines drop out."""
     try:
-        rows = [[float(word) for word in line.split()] for line in read_bytes(path).decode("utf-8").splitlines()]
+        rows = [[float(word) for word in line.split()] for line in read_text(path).splitlines()]
     except ValueError:  # UnicodeDecodeError is one
         raise InputError(f"{path}: expected lines of numbers, got other text") from None
     return [row for row in rows if row]
@@ -92,13 +95,22 @@ def _calibration(path: Path) -> Calibration:
     return Calibration(fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-def _pose(path: Path) -> NDArray[np.float64]:
+def _without_image(folder: Path) -> list[str]:
+    """A sentence on poses that no image has."""
+    images = {path.stem for path in (folder / _IMAGES).iterdir() if is_photograph(path)}
+    left = sorted(
+        p.name for p in (folder / _POSES).glob("*.txt") if p.stem not in images and not p.name.startswith(".")
+    )
+    return [f"{len(left)} poses are of no image in {_IMAGES}, and are left out: {named(left)}"] if left else []
+
+
+def _pose(poses: Poses, listed: str, path: Path) -> NDArray[np.float64] | None:
     if not path.is_file():
         raise InputError(f"{path}: expected the pose of an image, but there is no such file")
     matrix = _matrix(path, _rows(path))
     try:
         matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
-        return rigid_pose(matrix)
+        return poses.read(listed, matrix)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

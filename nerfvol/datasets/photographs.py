@@ -75,6 +75,9 @@ class Photographs:
             lens, image = dataset.cameras[i].intrinsics, dataset.images[i]
             if over is not None and image.shape[2] == 4:
                 image = composite_average(image, over, 1)
+            if (mask := dataset.mask(i)) is not None:
+                own = image[..., 3] if image.shape[2] == 4 else 255
+                image = np.concatenate([image[..., :3], np.minimum(mask, own)[..., None]], axis=2)
             return undistorted(image, canvases[lens], *grids[lens]) if lens in grids else image
 
         self._sources = map_threads(make, range(len(dataset)), self._threads)

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerfvol.cameras.camera import Intrinsics, tile_pixels
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.errors import InputError, shown
 from nerfvol.kernels.state import TILE_RAYS, Batch
 from nerfvol.native import native
 
@@ -19,6 +20,14 @@ class Cursor:
 
     epoch: int = 0
     position: int = 0
+
+    @classmethod
+    def of(cls, state: Mapping[str, int]) -> Cursor:
+        """From what ``dataclasses.asdict`` made of one; ValueError where it holds no counts."""
+        epoch, position = state["epoch"], state["position"]
+        if type(epoch) is not int or type(position) is not int or min(epoch, position) < 0:
+            raise ValueError(f"a queue's place must be counts, got {shown(epoch)} and {shown(position)}")
+        return cls(epoch, position)
 
 
 @dataclass
@@ -31,7 +40,7 @@ class Cursors:
     @classmethod
     def of(cls, state: Mapping[str, Mapping[str, int]]) -> Cursors:
         """From what ``dataclasses.asdict`` made of them."""
-        return cls(Cursor(**state["foreground"]), Cursor(**state["background"]))
+        return cls(Cursor.of(state["foreground"]), Cursor.of(state["background"]))
 
 
 class TileBank:
@@ -50,6 +59,7 @@ class TileBank:
         self.origins = np.stack([c.c2w[:3, 3] for c in cameras]).astype(np.float32)
         self.rotations = np.stack([c.c2w[:3, :3] for c in cameras]).astype(np.float32)
         self.pixel_angle = float(np.median([1 / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras]))
+        masks = dataset.weights(k)
         tables: dict[Intrinsics, np.ndarray] = {}  # camera-space directions in tile order, per distinct intrinsics
         self._directions: list[np.ndarray] = []
         insides, image_of, tile_of = [], [], []
@@ -59,7 +69,7 @@ class TileBank:
             if intrinsics not in tables:
                 tables[intrinsics] = intrinsics.directions().reshape(-1, 3)[np.maximum(flat, 0)]
             self._directions.append(tables[intrinsics])
-            insides.append(flat >= 0 if (flat < 0).any() else None)
+            insides.append(_counting(flat, None if masks is None else masks[i]))
             image_of.append(np.full(len(flat), i, np.int32))
             tile_of.append(np.arange(len(flat), dtype=np.int32))
         self.is_background = self.row == 0
@@ -67,9 +77,20 @@ class TileBank:
         self.tile = np.concatenate(tile_of)
         self._inside = insides
         self._padded = any(inside is not None for inside in insides)
+        counts = np.concatenate([
+            np.ones(len(directions), bool) if inside is None else inside.any(axis=1)
+            for inside, directions in zip(insides, self._directions, strict=True)
+        ])  # fmt: skip
         self.foreground_tiles, self.background_tiles = (
-            np.flatnonzero(chosen).astype(np.int32) for chosen in (~self.is_background, self.is_background)
+            np.flatnonzero(chosen & counts).astype(np.int32) for chosen in (~self.is_background, self.is_background)
         )
+        if not counts.any():
+            raise InputError(f"{dataset.source}: masks leave nothing of the images averaged by {k}")
+
+    @property
+    def _n_counting(self) -> int:
+        """Tiles of which anything counts: a mask may leave out whole ones."""
+        return len(self.foreground_tiles) + len(self.background_tiles)
 
     @property
     def n_tiles(self) -> int:
@@ -93,11 +114,12 @@ class TileBank:
         ):
             if count:
                 parts.append(_next(tiles, cursor, count, [seed, stream]))
-                weights.append(np.full(count, len(tiles) / self.n_tiles * n / count, np.float32))
+                weights.append(np.full(count, len(tiles) / self._n_counting * n / count, np.float32))
         return self.batch(np.concatenate(parts), np.concatenate(weights))
 
     def batch(self, tiles: np.ndarray, tile_weights: np.ndarray) -> Batch:
-        """Rays and colours of the ``tiles`` (n,) int, in rising order; padding weighs 0, every other ray its tile's weight.
+        """Rays and colours of the ``tiles`` (n,) int, in rising order; padding weighs 0, every other ray its tile's weight
+        times its mask's.
 
         tile_weights: (n,) float32. The batch's arrays are float32: rays_o (n, 3), rays_d and target (64 n, 3), weight (64 n,).
         """
@@ -117,8 +139,16 @@ class TileBank:
         if self._padded:
             for i, (m, t) in enumerate(zip(image, tile, strict=True)):
                 if self._inside[m] is not None:
-                    weight[i] *= self._inside[m][t]
+                    weight[i] *= self._inside[m][t] * np.float32(1 / 255)
         return Batch(self.origins[image], directions.reshape(-1, 3), target.reshape(-1, 3), weight.reshape(-1))
+
+
+def _counting(flat: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
+    """How much the pixels ``flat`` (n, 64) of an image's tiles count, uint8: 0 for padding, else the mask's; None: all."""
+    padding = flat < 0
+    if mask is None:
+        return np.where(padding, 0, 255).astype(np.uint8) if padding.any() else None
+    return np.where(padding, 0, mask.reshape(-1)[np.maximum(flat, 0)]).astype(np.uint8)
 
 
 def _tiled(image: np.ndarray) -> np.ndarray:
@@ -146,6 +176,8 @@ def foreground_share(dataset: Dataset, background: Sequence[float], views: int =
 def _next(tiles: np.ndarray, cursor: Cursor, count: int, seed: list[int]) -> np.ndarray:
     """The next ``count`` of an endless sequence of shuffled epochs."""
     out = []
+    if cursor.position >= len(tiles):  # of a set that was larger
+        cursor.epoch, cursor.position = cursor.epoch + 1, 0
     while count > 0:
         order = _permutation(len(tiles), (*seed, cursor.epoch))
         taken = order[cursor.position : cursor.position + count]

@@ -10,12 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from nerfvol.cameras.calibration import finite_number, read_calibration, read_matrix
-from nerfvol.cameras.camera import rigid_pose
+from nerfvol.cameras.calibration import CALIBRATION_KEYS, finite_number, read_calibration, read_matrix
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.formats import SPLITS
-from nerfvol.datasets.listing import Frame, ImageFinder, Listing, hold_out
-from nerfvol.errors import InputError
+from nerfvol.datasets.listing import Frame, ImageFinder, Listing, MaskFinder, Poses, hold_out, named
+from nerfvol.errors import InputError, shown
 from nerfvol.files.atomic import read_json
 from nerfvol.region import check_box
 
@@ -29,102 +28,199 @@ def recognises(path: Path) -> bool:
 def read(path: Path, split: str) -> Listing:
     """The listing of one split of a folder with transforms*.json, or of one such file.
 
-    transforms_{train,val,test}.json are used as they are; where only one of val and test exists it is used for both. A
+    transforms_{train,val,test}.json are used as they are; where only one of val and test has pictures it is used for both. A
     single transforms.json is split by its own train/val/test_filenames or, without them, by holding out every 8th view.
 
     Raises:
         InputError: a file is no such JSON, there is none for the split, or a frame's name, pose or calibration cannot be used.
     """
     if path.is_file():
-        return _read_single(path, split)
+        return _single(_File(path), split)
     files = {s: path / f"transforms_{s}.json" for s in SPLITS if (path / f"transforms_{s}.json").is_file()}
     if not files:
-        return _read_single(path / "transforms.json", split)
-    if "val" not in files and "test" not in files:
-        return _read_single(files["train"], split)
+        return _single(_File(path / "transforms.json"), split)
+    if "train" not in files and split == "train":
+        raise InputError(f"{path}: expected transforms_train.json for the train views, but there is no such file")
+    read_files = {name: _File(file) for name, file in files.items()}
     messages = []
+    if "train" in files:
+        for name in [name for name in ("val", "test") if name in files and not read_files[name].present]:
+            n = len(read_files.pop(name).frames)
+            messages.append(
+                f"{files[name].name} lists {n} cameras without pictures: it cannot be scored against, and is left out"
+            )
+    if "val" not in read_files and "test" not in read_files:
+        listing = _single(read_files["train"], split)
+        listing.messages[:0] = messages
+        return listing
+    if (path / "transforms.json").is_file():
+        messages.append(f"transforms.json is not read: {' and '.join(file.name for file in files.values())} come first")
+    used = split
     other = {"val": "test", "test": "val"}.get(split)
-    if split not in files and other is not None and other in files:
+    if split not in read_files and other is not None and other in read_files:
         messages.append(f"there is no transforms_{split}.json: the {other} views are used instead")
-        files[split] = files[other]
-    if split not in files:
-        raise InputError(f"{path}: expected transforms_{split}.json for the {split} views, but there is no such file")
-    frames, hint = _read_file(files[split])
-    training, hint = _read_file(files["train"]) if "train" in files and split != "train" else (frames, hint)
-    return Listing(frames, training, files[split], hint, messages)
+        used = other
+    own = read_files[used]
+    train = read_files.get("train", own)
+    messages += _unused(path, files, split) + own.messages
+    return Listing(own.frames, train.frames, own.path, train.hint, messages)
 
 
-def _read_single(path: Path, split: str) -> Listing:
-    data = _load_json(path)
-    frames, hint = _parse(data, path)
+def _unused(path: Path, files: Mapping[str, Path], split: str) -> list[str]:
+    """Further transforms of the folder, which no split reads."""
+    others = sorted(entry.name for entry in path.glob("transforms*.json") if entry.name != "transforms.json"
+                    and entry not in files.values() and not entry.name.startswith("."))  # fmt: skip
+    return [f"not read: {named(others)}"] if others and split == "train" else []
+
+
+def _single(file: _File, split: str) -> Listing:
+    """A split of one file, by its own lists or by holding out."""
+    frames, messages = file.frames, list(file.messages)
+    lists = file.lists
     present = [frame for frame in frames if frame.path is not None]
     missing = [frame for frame in frames if frame.path is None]
-    named = _named_splits(data, path)
-    held = named.get("test", named.get("val"))
-    if "train" in named and held is not None:
-        wanted = named.get(split, held)
-        chosen = [f for f in present if f.listed in wanted]
-        training = [f for f in present if f.listed in named["train"]]
-        return Listing(chosen + [f for f in missing if f.listed in wanted], training, path, hint)
+    if lists:
+        unknown = sorted(name for names in lists.values() for name in names - {frame.listed for frame in frames})
+        if unknown:
+            messages.append(f"{len(unknown)} names in the lists of {file.path.name} are no frame's: {named(unknown)}")
+    taken = lists.get("train")
+    held = lists.get("test" if split == "test" else "val") or lists.get("val") or lists.get("test")
+    if taken is not None or held is not None:
+        everything = {frame.listed for frame in frames}
+        if taken is None:
+            taken = everything - set().union(*lists.values())
+            messages.append(f"{file.path.name} lists views to hold out and none to train on: all others are trained on")
+        if held is None:
+            held = everything - taken
+            messages.append(
+                f"{file.path.name} lists views to train on and none to hold out: the {len(held)} others are held out"
+            )
+        left = everything - taken - set().union(*(lists.get(name, set()) for name in ("val", "test")), held)
+        if left:
+            messages.append(
+                f"{len(left)} frames are in no list of {file.path.name} and are not used: {named(sorted(left))}"
+            )
+        if both := sorted(taken & held):
+            messages.append(f"{len(both)} views are trained on and held out too, so that scores flatter: {named(both)}")
+        wanted = taken if split == "train" else held
+        training = [f for f in present if f.listed in taken]
+        if not wanted & everything or (split != "train" and not any(f.listed in held for f in present)):
+            which = "train" if split == "train" else "val"
+            raise InputError(
+                f"{file.path}: no frame is left for the {which} views; list some in {which}_filenames, or leave the lists out"
+            )
+        return Listing([f for f in frames if f.listed in wanted], training, file.path, file.hint, messages)
     if not present:
-        return Listing(frames, frames, path, hint)
+        return Listing(frames, frames, file.path, file.hint, messages)
     chosen, training, sentence = hold_out(present, split)
-    return Listing(chosen + missing, training, path, hint, [sentence])
+    return Listing(chosen + missing, training, file.path, file.hint, [*messages, sentence])
+
+
+class _File:
+    """One transforms*.json, read: frames, lists of splits, bounds, and what there is to say.
+
+    Raises InputError where it cannot be used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        data = _load_json(path)
+        self.lists = _named_splits(data, path)
+        finder, masks, poses = ImageFinder(path.parent), MaskFinder(path.parent), Poses(path)
+        shared = {key: value for key, value in data.items() if key != "frames"}
+        self.frames = []
+        for number, entry in enumerate(data["frames"]):
+            frame = _frame(f"{path}, frame {number}", entry, shared, finder, masks, poses)
+            if frame is not None:
+                self.frames.append(frame)
+        try:
+            self.hint = _hint(data)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        self.messages = poses.messages() + masks.messages([f for f in self.frames if f.path is not None])
+        self.messages += _not_used(path, data)
+        if len({frame.listed for frame in self.frames}) < len(self.frames):
+            listed = [frame.listed for frame in self.frames]
+            twice = sorted({name for name in listed if listed.count(name) > 1})
+            self.messages.append(
+                f"{len(twice)} images are listed more than once, each with a pose of its own: {named(twice)}"
+            )
+
+    @property
+    def present(self) -> bool:
+        """Whether any of its images is there."""
+        return any(frame.path is not None for frame in self.frames)
+
+
+def _frame(
+    where: str, entry: Any, shared: Mapping[str, Any], finder: ImageFinder, masks: MaskFinder, poses: Poses
+) -> Frame | None:
+    """The frame of an entry; None where its pose was lost."""
+    if not isinstance(entry, dict):
+        raise InputError(f"{where}: expected an object with file_path and transform_matrix, got {shown(entry):.60}")
+    listed = entry.get("file_path")
+    if not isinstance(listed, str) or not listed or "\0" in listed:
+        raise InputError(f"{where}: expected file_path to name an image, got {shown(listed):.60}")
+    where = f"{where} ({listed})"
+    if "transform_matrix" not in entry:
+        raise InputError(f"{where}: transform_matrix is missing")
+    everything = {**shared, **entry}
+    mask = everything.get("mask_path")
+    if mask is not None and (not isinstance(mask, str) or "\0" in mask):
+        raise InputError(f"{where}: expected mask_path to name an image, got {shown(mask):.60}")
+    try:
+        c2w = poses.read(listed, read_matrix(entry["transform_matrix"]))
+        calibration = read_calibration(everything)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    if c2w is None:
+        return None
+    path = finder.find(listed)
+    return Frame(listed, path, c2w, calibration, masks.of(listed, path, mask or None))
+
+
+_USED = {"frames", "file_path", "transform_matrix", "mask_path", "aabb", "aabb_scale", "ply_file_path",
+         *CALIBRATION_KEYS, *(f"{split}_filenames" for split in SPLITS)}  # fmt: skip
+_EMPTY = (None, "", [], {}, 0, 0.0, False)
+
+
+def _not_used(path: Path, data: Mapping[str, Any]) -> list[str]:
+    """A sentence on what the file says and nothing here looks at. Keys that say nothing (zero, empty, null) do not count."""
+    top = sorted(key for key, value in data.items() if key not in _USED and value not in _EMPTY)
+    inside = {
+        key for entry in data["frames"] for key, value in entry.items() if key not in _USED and value not in _EMPTY
+    }
+    told = [*top, *(f"{key} (of frames)" for key in sorted(inside))]
+    return [f"{path.name} states what is not used: {named(told, 8)}"] if told else []
 
 
 def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
-    """nerfstudio's train_filenames, val_filenames and test_filenames, those that are there."""
-    named = {}
+    """nerfstudio's train_filenames, val_filenames and test_filenames, those that are there; ./ and \\ as frames have them."""
+    by_name = {_plain(entry["file_path"]): entry["file_path"] for entry in data["frames"]
+               if isinstance(entry, dict) and isinstance(entry.get("file_path"), str)}  # fmt: skip
+    by_stem = {name.rpartition(".")[0] or name: listed for name, listed in by_name.items()}
+    found = {}
     for split in SPLITS:
         names = data.get(f"{split}_filenames")
         if not names:
             continue
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"{path}: {split}_filenames must be a list of file names, got {names!r:.60}")
-        named[split] = set(names)
-    return named
+            raise InputError(f"{path}: {split}_filenames must be a list of file names, got {shown(names):.60}")
+        plain = [_plain(name) for name in names]
+        found[split] = {by_name.get(name) or by_stem.get(name.rpartition(".")[0] or name) or name for name in plain}
+    return found
 
 
-def _read_file(path: Path) -> tuple[list[Frame], BoundsHint]:
-    return _parse(_load_json(path), path)
+def _plain(name: str) -> str:
+    """A path in one spelling."""
+    return "/".join(part for part in name.replace("\\", "/").split("/") if part not in ("", "."))
 
 
 def _load_json(path: Path) -> dict[str, Any]:
-    try:
-        data = read_json(path)
-    except InputError:
-        raise
-    except ValueError as error:  # a number of more digits than Python converts
-        raise InputError(f"{path} is not usable JSON: {error}") from error
+    data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f'{path}: expected a JSON object with a non-empty list "frames"')
     return data
-
-
-def _parse(data: Mapping[str, Any], path: Path) -> tuple[list[Frame], BoundsHint]:
-    finder = ImageFinder(path.parent)
-    shared = {key: value for key, value in data.items() if key != "frames"}
-    frames = []
-    for number, entry in enumerate(data["frames"]):
-        where = f"{path}, frame {number}"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where}: expected an object with file_path and transform_matrix, got {entry!r:.40}")
-        listed = entry.get("file_path")
-        if not isinstance(listed, str) or not listed or "\0" in listed:
-            raise InputError(f"{where}: expected file_path to name an image, got {listed!r:.40}")
-        where = f"{where} ({listed})"
-        if "transform_matrix" not in entry:
-            raise InputError(f"{where}: transform_matrix is missing")
-        try:
-            c2w = rigid_pose(read_matrix(entry["transform_matrix"]))
-            calibration = read_calibration({**shared, **entry})
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-        frames.append(Frame(listed, finder.find(listed), c2w, calibration))
-    try:
-        return frames, _hint(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _hint(data: Mapping[str, Any]) -> BoundsHint:

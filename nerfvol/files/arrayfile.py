@@ -86,7 +86,7 @@ class ArrayFile:
             document = json.loads(metadata[_DOCUMENT_KEY])
         except KeyError as error:
             raise self.fault("it was not written by nerfvol (its header holds no nerfvol document)") from error
-        except (json.JSONDecodeError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:  # ValueError: also a number of thousands of digits
             raise self.fault("the document in its header is not JSON") from error
         if not isinstance(document, dict):
             raise self.fault("the document in its header is not a JSON object")

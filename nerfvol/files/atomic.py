@@ -6,16 +6,20 @@ back as one :class:`~nerfvol.errors.InputError` that names the path.
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import json
 import os
 import secrets
+import shutil
+import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 
 _REASONS = {
     errno.ENOSPC: "no space is left on the device",
@@ -37,17 +41,34 @@ def explain_os_error(error: OSError) -> str:
     return _REASONS.get(error.errno or 0, lines[0])
 
 
+def is_special(path: str | os.PathLike[str]) -> bool:
+    """Whether ``path`` is a pipe, a device or a process's own stream (/dev/stdout): what cannot be renamed over."""
+    text = os.path.abspath(os.fspath(path))
+    try:
+        kind = os.stat(text).st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)) or text.startswith(("/dev/fd/", "/dev/std", "/proc/"))
+
+
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path next to ``path``; on success sync it and rename it to ``path``, on failure remove it.
 
-    The temporary name keeps the suffix of ``path``, since image and video writers choose their format by it.
+    The temporary name keeps the suffix of ``path``, since image and video writers choose their format by it. Where ``path``
+    is a link, the file that it names is written. Into a pipe or a device, which no rename may replace, the finished file is
+    copied.
 
     Raises:
         InputError: the disk is full, the folder is missing or not writable (the message names ``path``).
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.{secrets.token_hex(4)}.tmp{target.suffix}")
+    if is_special(path):
+        with _through(Path(path)) as temporary:
+            yield temporary
+        return
+    named = Path(path)
+    target = Path(os.path.realpath(named)) if named.is_symlink() else named
+    temporary = target.with_name(f".{target.stem[:80]}.{os.getpid()}.{secrets.token_hex(4)}.tmp{target.suffix[:40]}")
     try:
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
@@ -59,10 +80,25 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         # A reader's error inside the block keeps its own name: only failures to write become "cannot write".
         if error.filename is not None and Path(os.fsdecode(error.filename)) not in (temporary, target):
             raise
-        raise InputError(f"cannot write {target}: {explain_os_error(error)}") from error
+        raise InputError(f"cannot write {named}: {explain_os_error(error)}") from error
     finally:
         with contextlib.suppress(OSError):  # gone after the rename, or never made
             temporary.unlink()
+
+
+@contextlib.contextmanager
+def _through(target: Path) -> Iterator[Path]:
+    """A temporary file whose content goes into the pipe or device ``target`` once it is whole."""
+    if stat.S_ISBLK(target.stat().st_mode) or stat.S_ISSOCK(target.stat().st_mode):
+        raise InputError(f"cannot write {target}: it is neither a file nor a pipe")
+    with tempfile.TemporaryDirectory() as folder:
+        temporary = Path(folder) / f"whole{target.suffix}"
+        yield temporary
+        try:
+            with temporary.open("rb") as whole, target.open("wb") as out:
+                shutil.copyfileobj(whole, out)
+        except OSError as error:
+            raise InputError(f"cannot write {target}: {explain_os_error(error)}") from error
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes | memoryview) -> None:
@@ -117,16 +153,53 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise InputError(f"cannot read {path}: {explain_os_error(error)}") from error
 
 
+def read_text(path: str | os.PathLike[str]) -> str:
+    """The text of the file ``path``: UTF-8, or UTF-16 where its byte order mark says so; the mark itself is left out.
+
+    Raises:
+        InputError: it cannot be read.
+        UnicodeDecodeError: it is no text.
+    """
+    data = read_bytes(path)
+    wide = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return data.decode("utf-16" if wide else "utf-8-sig")
+
+
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """The JSON document in ``path``; anything else is an :class:`InputError` that names the file and the place."""
+    """The JSON document in ``path``; anything else is an :class:`InputError` that names the file and the place.
+
+    A key that an object states twice is refused: which of the two was meant is not known.
+    """
     try:
-        return json.loads(read_bytes(path).decode("utf-8"))
+        return json.loads(read_text(path), object_pairs_hook=_once)
+    except InputError:
+        raise
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not JSON: it is not UTF-8 text") from error
     except json.JSONDecodeError as error:
         raise InputError(f"{path} is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
     except RecursionError as error:
         raise InputError(f"{path} is not usable JSON: it is nested too deeply") from error
+    except _Twice as error:
+        raise InputError(f"{path} is not usable JSON: an object states {shown(error.key)} twice") from error
+    except ValueError as error:  # a number of more digits than Python converts
+        raise InputError(f"{path} is not usable JSON: it holds a number of thousands of digits") from error
+
+
+class _Twice(ValueError):
+    def __init__(self, key: str) -> None:
+        super().__init__(key)
+        self.key = key
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The object of these pairs; _Twice where two have one key."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise _Twice(key)
+        found[key] = value
+    return found
 
 
 def _sync(path: Path) -> None:

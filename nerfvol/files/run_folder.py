@@ -18,6 +18,8 @@ METRICS = "metrics.json"
 LOG = "log.jsonl"
 PREVIEWS = "previews"
 PREVIOUS = "previous"
+UNFINISHED = "unfinished"
+"""Where a run without a model goes when ``previous`` holds one that must not be lost to it."""
 
 
 def model_path(target: str | os.PathLike[str]) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
+from nerfvol.errors import InputError
 from nerfvol.native import native
 
 
@@ -62,4 +63,7 @@ def release_arenas() -> None:
 
 
 if native() is not None and "NERFVOL_ISA" in os.environ:
-    set_isa(os.environ["NERFVOL_ISA"])
+    try:
+        set_isa(os.environ["NERFVOL_ISA"] or "auto")
+    except ValueError as error:
+        raise InputError(f"the environment's NERFVOL_ISA cannot be used: {error}") from None

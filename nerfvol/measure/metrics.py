@@ -37,12 +37,15 @@ def psnr(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> float:
     return -10 * math.log10(mse) if mse > 0 else math.inf if mse == 0 else math.nan
 
 
-def ssim(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> float:
+def ssim(image: Tensor | ArrayLike, reference: Tensor | ArrayLike, seen: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity [Wang 2004] of images (h, w, channels) in [0, 1], h and w at least 11.
 
     11 x 11 Gaussian window with sigma 1.5, K = (0.01, 0.03), population covariance, the mean over the positions where
     the window lies inside the image and over the channels: scikit-image's structural_similarity(gaussian_weights=True,
     sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=2). Equal images score 1.
+
+    ``seen`` (h, w): the pixels that count. Elsewhere the image is taken to equal the reference, and the mean is over the
+    windows whose middle counts (over all where there is none).
 
     Raises:
         InputError: images of two shapes, smaller ones, or values that are not floating point.
@@ -52,16 +55,26 @@ def ssim(image: Tensor | ArrayLike, reference: Tensor | ArrayLike) -> float:
         raise InputError(f"SSIM needs images (height, width, channels) of at least 11x11 pixels, got shape {a.shape}")
     height, width, channels = a.shape
     inner = height - _WINDOW + 1
+    if seen is not None:
+        return _ssim_where(np.where(seen[..., None], a, b), b, seen)
     total = 0.0
     for channel in range(channels):
         for top in range(0, inner, _BAND):
             rows = slice(top, min(top + _BAND, inner) + _WINDOW - 1)
-            total += _similarity(a[rows, :, channel], b[rows, :, channel])
+            total += float(np.sum(_similarity(a[rows, :, channel], b[rows, :, channel]), dtype=np.float64))
     return total / (channels * inner * (width - _WINDOW + 1))
 
 
-def _similarity(a: Floats, b: Floats) -> float:
-    """The sum of the similarity over every position of the window inside two planes (h, w)."""
+def _ssim_where(a: Floats, b: Floats, seen: NDArray[np.bool_]) -> float:
+    """The mean similarity of a and b (h, w, channels) over the windows whose middle is ``seen`` (h, w)."""
+    half = _WINDOW // 2
+    middle = seen[half : seen.shape[0] - half, half : seen.shape[1] - half]
+    maps = np.stack([_similarity(a[..., channel], b[..., channel]) for channel in range(a.shape[2])], axis=-1)
+    return float(np.mean(maps[middle] if middle.any() else maps, dtype=np.float64))
+
+
+def _similarity(a: Floats, b: Floats) -> Floats:
+    """The similarity at every position of the window inside two planes (h, w): (h - 10, w - 10)."""
     maps = np.empty((5, *a.shape), dtype=a.dtype)
     # Moments about 1/2, a constant that cancels in the covariances, lose less to rounding than moments about 0.
     np.subtract(a, a.dtype.type(0.5), out=maps[0])
@@ -75,7 +88,7 @@ def _similarity(a: Floats, b: Floats) -> float:
     c1, c2 = a.dtype.type(_K1**2), a.dtype.type(_K2**2)
     numerator = (2 * mu_a * mu_b + c1) * (2 * cov + c2)
     denominator = (mu_a * mu_a + mu_b * mu_b + c1) * (var_a + var_b + c2)
-    return float(np.sum(numerator / denominator, dtype=np.float64))
+    return numerator / denominator
 
 
 def _window_means(maps: Floats) -> Floats:

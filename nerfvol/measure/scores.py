@@ -15,6 +15,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.images import map_threads
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
+from nerfvol.errors import InputError
 from nerfvol.files import pictures
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import psnr, ssim
@@ -36,24 +37,29 @@ def score_views(
     """Scores of ``render`` (camera -> (H, W, 3) float32) against every image of ``dataset`` over ``background``.
 
     Returns psnr and ssim (means of the per-view values), seconds_per_frame (median) and rows with name, psnr, ssim and
-    seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair.
+    seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that masks leave out,
+    or that the lens does not reach, take no part; views of which nothing is left have no row.
     """
 
     def score(rendered: tuple[int, Float, float]) -> dict[str, Any]:
         index, image, seconds = rendered
         truth = dataset.composited(index, background)
+        seen = _seen(dataset, index)
         return {
             "name": dataset.names[index],
-            "psnr": min(psnr(image, truth), LARGEST_PSNR),
-            "ssim": ssim(image, truth),
+            "psnr": min(psnr(image, truth) if seen is None else psnr(image[seen], truth[seen]), LARGEST_PSNR),
+            "ssim": ssim(image, truth, seen),
             "seconds": seconds,
         }
 
     rows, at_once = [], ops.get_threads()
-    for first in range(0, len(dataset), at_once):
+    scored = [i for i in range(len(dataset)) if (seen := _seen(dataset, i)) is None or seen.any()]
+    if not scored:
+        raise InputError(f"{dataset.source}: masks leave nothing of the images to score")
+    for first in range(0, len(scored), at_once):
         # A few views one after the other, for their times; then their scores side by side.
         few = []
-        for index in range(first, min(first + at_once, len(dataset))):
+        for index in scored[first : first + at_once]:
             started = time.perf_counter()
             image = render(dataset.cameras[index])
             seconds = time.perf_counter() - started
@@ -68,6 +74,12 @@ def score_views(
         "seconds_per_frame": statistics.median(row["seconds"] for row in rows),
         "rows": rows,
     }
+
+
+def _seen(dataset: Dataset, index: int) -> NDArray[np.bool_] | None:
+    """The pixels (h, w) of a view that count, None for all."""
+    mask = dataset.mask(index)
+    return None if mask is None else mask > 127
 
 
 def evaluate(

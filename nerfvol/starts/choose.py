@@ -34,7 +34,7 @@ class Start:
 def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = None, seed: int = 0) -> Start:
     """The points that splats of this dataset begin from.
 
-    Objects on a transparent background begin from random points in their box; photographs from the points of their COLMAP
+    Objects before nothing or a plain backdrop begin from random points in their box; photographs from the points of their COLMAP
     model, else from a plane sweep; a model of fewer than 4,000 points gets the sweep's as well. Where a sweep finds
     nothing, what there is of a model, or random points, are used. ``name``: "points", "sweep", "points+sweep" or "random".
 
@@ -56,8 +56,8 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
 
 def _suited(dataset: Dataset) -> tuple[str, str]:
     """The row that suits a dataset and why."""
-    if dataset.scene.has_alpha:
-        return "random", "an object on a transparent background is seen whole"
+    if not dataset.scene.is_unbounded:
+        return "random", "an object without surroundings is seen whole"
     if not has_points(dataset):
         return "sweep", "photographs with poses alone"
     n = len(model_points(dataset)[0])

@@ -5,6 +5,7 @@ COLMAP's come with the data set (``Dataset.points``); nerfstudio's transforms.js
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,8 @@ def model_points(dataset: Dataset) -> tuple[PointCloud, str]:
     path = _named_file(dataset)
     if path is not None:
         cloud = read_points(path)
+        if dataset.frame is not None:
+            cloud = replace(cloud, positions=dataset.frame.into(cloud.positions))
         return cloud, f"{len(cloud)} points of {path}"
     points = dataset.points
     if points is None:

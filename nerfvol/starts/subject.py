@@ -56,5 +56,6 @@ def _llff_depths(dataset: Dataset) -> tuple[float, float] | None:
     if source.name != POSES or not source.is_file():
         return None
     rows = np.load(source, allow_pickle=False)  # its reader has checked it
-    near, far = float(rows[:, 15].min()), float(rows[:, 16].max())
+    unit = 1.0 if dataset.frame is None else dataset.frame.scale
+    near, far = float(np.nanmin(rows[:, 15])) / unit, float(np.nanmax(rows[:, 16])) / unit
     return (near, far) if 0 < near < far else None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,17 @@ import numpy as np
 from nerfvol.config.assemble import read_yaml, to_plain, write_yaml
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.fingerprint import changes, fingerprint
+from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.images import composite_average
 from nerfvol.datasets.load import load_dataset
+from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import ensure_writable_folder, explain_os_error
-from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, PREVIOUS, PRODUCTS
+from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, PREVIOUS, PRODUCTS, UNFINISHED
+from nerfvol.starts.region import region_of_sweep
+
+Colour = tuple[float, float, float]
 
 HELD_OUT_KEPT = 32 << 20
 """Bytes of held-out images that a run keeps; more are read once again to be scored."""
@@ -57,7 +63,8 @@ def check_folder(config: Config) -> Path:
 def claim_folder(config: Config) -> None:
     """Put an earlier run in the folder aside and write the resolved config: for a run that has made its first step.
 
-    The earlier run moves to RUN/previous (one generation is kept), unless this run resumes it.
+    The earlier run moves to RUN/previous (one generation is kept), unless this run resumes it; to RUN/unfinished where it has
+    no model and RUN/previous has one.
     """
     run = Path(config.out)
     if not config.resume:
@@ -84,7 +91,10 @@ def _set_aside(run: Path) -> None:
     old = [run / name for name in _FILES if (run / name).is_file()]
     if not old:
         return
-    previous = ensure_writable_folder(run / PREVIOUS)
+    finished = any((run / name).is_file() for name in PRODUCTS)
+    kept = any((run / PREVIOUS / name).is_file() for name in PRODUCTS)
+    # A generation without a model never takes the place of one that has one.
+    previous = ensure_writable_folder(run / (PREVIOUS if finished or not kept else UNFINISHED))
     try:
         for name in _FILES:  # a file of the generation before must not mix with it
             (previous / name).unlink(missing_ok=True)
@@ -101,6 +111,7 @@ class Data:
 
     compared: parts of held-out views on which field, distilled and fine-tuned octree are compared. first: the first
     held-out view, for previews. reading: seconds that it takes to read the held-out images again; 0: they are kept.
+    frame: what all of them are in; the finished model is brought back from it. fingerprint: of the training views.
     """
 
     training: Dataset
@@ -108,6 +119,8 @@ class Data:
     compared: Dataset
     first: Dataset
     reading: float
+    frame: Frame = field(default_factory=Frame)
+    fingerprint: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def held_out_bytes(self) -> int:
@@ -122,19 +135,64 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
         InputError: the data cannot be used, or there is nothing in the images.
     """
     started = time.perf_counter()
-    held_out = load_dataset(config.data, "val", config.downscale, config.aabb, holdout=config.holdout)
-    held_out = held_out.evenly(LARGEST_HELD_OUT)
+    held_out = load_dataset(
+        config.data, "val", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene
+    ).evenly(LARGEST_HELD_OUT)
     first = held_out.evenly(1)
     compared = held_out.evenly(config.compare_views).middles(COMPARED_SIZE)
     reading = 0.0
     if held_out.nbytes > HELD_OUT_KEPT:  # else released until they are scored
         held_out.release()
         reading = time.perf_counter() - started
-    training = load_dataset(config.data, "train", config.downscale, config.aabb, holdout=config.holdout)
+    training = load_dataset(
+        config.data, "train", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene
+    )
     for message in training.messages:
         say(message)
-    require_something(training, config.background)
-    return Data(training, held_out, compared, first, reading)
+    others = [message for message in held_out.messages if message not in training.messages]
+    for message in others:
+        say(f"of the held-out views: {message}")
+    if training.scene.is_guess and (better := region_of_sweep(training)) is not None:
+        scene, sentence = better
+        say(sentence)
+        training, held_out, compared, first = (replace(d, scene=scene) for d in (training, held_out, compared, first))
+    require_something(training, background_of(config, training, say))
+    frame = Frame.of(training.scene)
+    if not frame.is_identity:
+        say(
+            "the scene lies far from the origin, or its unit is extreme: it is trained in a frame of its own, and the model "
+            "comes back in the units of the poses"
+        )
+    moved = [frame.dataset_into(d) for d in (training, held_out, compared, first)]
+    return Data(moved[0], moved[1], moved[2], moved[3], reading, frame, fingerprint(training))
+
+
+def require_same(saved: Mapping[str, Any] | None, data: Data, checkpoint: Path) -> None:
+    """An InputError where a resumed run's training pictures are not those it was begun with.
+
+    Checkpoints of versions that kept no record are not held to one.
+    """
+    before = None if saved is None else saved.get("data")
+    if before is None:
+        return
+    try:
+        different = changes(before, data.fingerprint)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{checkpoint} is damaged: its record of the pictures cannot be read ({error})") from error
+    if different is not None:
+        raise InputError(
+            f"--resume: the pictures are not those that the run was begun with: {different}; put them back, or train again from "
+            "the start"
+        )
+
+
+def background_of(config: Config, training: Dataset, say: Callable[[str], object] | None = None) -> Colour:
+    """The colour (3,) behind the scene: see Config.before."""
+    backdrop = training.backdrop
+    if backdrop is not None and config.background not in (None, backdrop) and say is not None:
+        colour = ",".join(f"{c:.3g}" for c in backdrop)
+        say(f"--background is not used while training: the pictures are opaque and have {colour} behind them")
+    return config.before(backdrop).background or WHITE
 
 
 def require_something(dataset: Dataset, background: Sequence[float]) -> None:

@@ -20,7 +20,8 @@ import numpy as np
 from nerfvol.cameras.paths import describe_orbit
 from nerfvol.config.training import Config
 from nerfvol.datasets.images import composite_average
-from nerfvol.errors import InputError
+from nerfvol.defaults import WHITE
+from nerfvol.errors import InputError, shown
 from nerfvol.files import pictures, run_folder
 from nerfvol.files.atomic import ensure_writable_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
@@ -28,8 +29,10 @@ from nerfvol.kernels import ops
 from nerfvol.kernels.state import StepReport
 from nerfvol.machine import process_seconds, return_free_memory
 from nerfvol.measure.metrics import ssim
+from nerfvol.models import Model
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder
+from nerfvol.views import OctreeModel, SplatModel
 
 RESERVE_SHARE = 0.2
 """Of a time budget, the most that is kept for writing and scoring."""
@@ -74,8 +77,20 @@ def read_saved(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is no checkpoint of a training run")
     for name, kind in _STATE.items() if phase != "done" else ():
         if not isinstance(state[name], kind):
-            raise InputError(f"{path} is damaged: its {name} is {state[name]!r}")
+            raise InputError(f"{path} is damaged: its {name} is {shown(state[name])}")
+    if phase != "done":
+        _check_numbers(path, state)
     return state
+
+
+def _check_numbers(path: Path, state: dict[str, Any]) -> None:
+    """InputError where a number of the state is none that a run can go on with."""
+    for name in ("elapsed", "phase_started"):
+        if not 0 <= state[name] < math.inf:
+            raise InputError(f"{path} is damaged: its {name} is {shown(state[name])}")
+    steps = state["steps"]
+    if state["log_bytes"] < 0 or not all(type(n) is int and n >= 0 and name in PHASES for name, n in steps.items()):
+        raise InputError(f"{path} is damaged: its counts are {shown(state['log_bytes'])} and {shown(steps)}")
 
 
 class Run:
@@ -87,7 +102,9 @@ class Run:
     def __init__(
         self, config: Config, data: Data, clock: Clock, saved: dict[str, Any] | None, say: Say = print
     ) -> None:
-        self.given, self.config = config, config.for_scene(data.training.scene)
+        self.given = config
+        self.config = config.for_scene(data.training.scene).before(data.training.backdrop)
+        self.background: tuple[float, float, float] = self.config.background or WHITE
         self.data, self.clock, self.say = data, clock, say
         self.folder = Path(config.out)
         self.checkpoint = self.folder / run_folder.CHECKPOINT
@@ -102,6 +119,7 @@ class Run:
         self._entered = False  # a phase, without a step since
         self._reserve = self._time_to_finish()
         self._last_save = time.perf_counter()
+        self._warned: set[str] = set()
 
     def enter(self, phase: Phase) -> None:
         """Begin the phase, or go on inside it where the checkpoint was written in it.
@@ -203,11 +221,25 @@ class Run:
         state = {
             "phase": phase.name, "elapsed": self.clock.elapsed(), "phase_started": self.phase_started,
             "running": self.running, "log_bytes": 0 if self._log is None else self._log.tell(), "results": self.results,
-            "steps": self.steps, "trainer": phase.state_dict(),
+            "steps": self.steps, "trainer": phase.state_dict(), "data": dict(self.data.fingerprint),
         }  # fmt: skip
         save_checkpoint(self.checkpoint, state)
         self.release_images(phase)
         self._last_save = time.perf_counter()
+
+    def save_if_possible(self, phase: Phase) -> None:
+        """As :meth:`save`; a disk that is full for a while costs a checkpoint and a sentence, not the run."""
+        try:
+            self.save(phase)
+        except InputError as error:
+            self._last_save = time.perf_counter()
+            self.warn(f"{error}; the run goes on without this checkpoint")
+
+    def warn(self, sentence: str) -> None:
+        """Say it once, however often it happens."""
+        if sentence not in self._warned:
+            self._warned.add(sentence)
+            self.say(f"warning: {sentence}")
 
     def enter_stage(self, phase: Phase) -> None:
         """What a change of the phase's stage brings: images that are needed no more, another time to finish, more memory."""
@@ -226,13 +258,18 @@ class Run:
         """The first held-out view, small: truth next to what the phase has."""
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
-        truth = np.divide(composite_average(image, self.config.background, k), 255, dtype=np.float32)
+        truth = np.divide(composite_average(image, self.background, k), 255, dtype=np.float32)
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
-        pictures.write_png(self.folder / run_folder.PREVIEWS / f"{phase.name}_{round(100 * moment):03d}.png", picture)
+        path = self.folder / run_folder.PREVIEWS / f"{phase.name}_{round(100 * moment):03d}.png"
+        try:
+            pictures.write_png(path, picture)
+        except InputError as error:
+            self.warn(f"{error}; the run goes on without this preview")
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
-        """The first Ctrl-C only sets a flag, so that the step in progress is finished; a second one ends at once."""
+        """The first Ctrl-C, SIGTERM (``kill``, a batch system's end) or SIGHUP (a closed terminal) only sets a flag, so that
+        the step in progress is finished; a second one ends at once. What is ignored, as nohup does, stays so."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -243,11 +280,14 @@ class Run:
             self.interrupted = True
             self.say("\nfinishing the step and saving (again: stop at once)")
 
-        before = signal.signal(signal.SIGINT, note)
+        numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        caught = [n for n in numbers if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
+        before = [(number, signal.signal(number, note)) for number in caught]
         try:
             yield
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, handler in before:
+                signal.signal(number, handler)
 
     def interruption(self, phase: Phase) -> KeyboardInterrupt:
         """What to raise once a checkpoint was written after Ctrl-C; says where the run is and how to go on."""
@@ -261,7 +301,17 @@ class Run:
         provenance = {"data": config.data, "init": config.init, "seed": config.seed, "downscale": config.downscale,
                       "steps": dict(self.steps), "time_budget": config.time_budget}  # fmt: skip
         orbit = describe_orbit(self.data.training.cameras, self.data.training.scene.aabb)
-        return {"provenance": provenance, "background": list(config.background), "orbit": orbit}
+        orbit = self.data.frame.orbit_back(orbit)
+        return {"provenance": provenance, "background": list(self.background), "orbit": orbit}
+
+    def in_scene_units(self, model: Model) -> Model:
+        """A model that was trained, in the units of the poses."""
+        frame = self.data.frame
+        if isinstance(model, OctreeModel):
+            return OctreeModel(frame.octree_back(model.octree), model.metadata)
+        if frame.is_identity or not isinstance(model, SplatModel):
+            return model
+        return SplatModel(frame.splats_back(model.splats), {**model.metadata, "near": model.near * frame.scale})
 
     def _time_to_finish(self, phase: Phase | None = None) -> float:
         """Seconds to keep for writing, reading the views and scoring.
@@ -271,7 +321,7 @@ class Run:
         if self.config.time_budget is None:
             return 0.0
         started = time.perf_counter()
-        image = self.data.first.composited(0, self.config.background)
+        image = self.data.first.composited(0, self.background)
         ssim(image, image)
         scoring = (time.perf_counter() - started) / ops.get_threads()  # so many views are scored side by side
         started = time.perf_counter()

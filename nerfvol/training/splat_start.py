@@ -78,4 +78,4 @@ def _from_file(run: Run, path: str, degree: int) -> Splats:
     if not n or (most is not None and n > most):
         raise InputError(f"--init {path}: it has {n:,} splats, expected 1 to {most or 'any number':,}")
     run.say(f"start: the {n:,} splats of {path}")
-    return model.splats.with_sh_degree(degree)
+    return run.data.frame.splats_into(model.splats.with_sh_degree(degree))

@@ -11,6 +11,7 @@ A checkpoint holds all that lives between two steps. It is written after the fir
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import time
@@ -27,6 +28,7 @@ from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import write_json
 from nerfvol.files.checkpoint import save_checkpoint
+from nerfvol.files.lock import only_writer
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
 from nerfvol.measure.scores import evaluate, score_views
@@ -35,14 +37,14 @@ from nerfvol.octree.tree import Octree
 from nerfvol.training.memory import OctreePlan, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
-from nerfvol.training.prepare import check_folder, load_data
+from nerfvol.training.prepare import check_folder, load_data, require_same
 from nerfvol.training.session import Clock, Run, Say, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
 PRODUCT = {"octree": run_folder.OCTREE, "splats": run_folder.SPLATS}
 WHY = {
-    "octree": "an object on a transparent background, or asked for by --init",
+    "octree": "an object without surroundings, or asked for by --init",
     "splats": "photographs, which splats draw sharper and sooner, or asked for by --init",
 }
 LOG_EVERY = 50
@@ -79,18 +81,24 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
     say = say or functools.partial(print, flush=True)
     keep_large_arrays_apart()
     out = check_folder(config)
+    try:
+        with only_writer(out, "trains"):
+            return _train(config, out, started, say)
+    except InputError:
+        with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays
+            out.rmdir()
+        raise
+
+
+def _train(config: Config, out: Path, started: float | None, say: Say) -> Results | None:
     saved = read_saved(out / run_folder.CHECKPOINT) if config.resume else None
     if saved is not None and saved["phase"] == "done":
         say(f"{out} is finished ({saved['steps']} steps), there is nothing to resume; its settings can be run again "
             f"with --config {out / run_folder.CONFIG}")  # fmt: skip
         return None
     clock = Clock(started, saved["elapsed"] if saved else 0.0)
-    try:
-        data = load_data(config, say)
-    except InputError:
-        with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays
-            out.rmdir()
-        raise
+    data = load_data(config, say)
+    require_same(saved, data, out / run_folder.CHECKPOINT)
     run = Run(config, data, clock, saved, say)
     with run.interruptible(), run:
         phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
@@ -107,7 +115,7 @@ def begin_octree(run: Run) -> OctreeTrainer:
     plan = OctreePlan(config, data.training, data.held_out_bytes)
     announce(run, plan.sentence())
     octree = start_from_field(run) if config.init == "mlp" and run.phase in ("start", "field") else None
-    return OctreeTrainer(data.training, config.background, config.octree, config.seed, octree, plan)
+    return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan)
 
 
 def begin_splats(run: Run) -> SplatTrainer:
@@ -115,13 +123,13 @@ def begin_splats(run: Run) -> SplatTrainer:
     from nerfvol.training.splat_start import make_schedule_of, start_splats
 
     config, dataset = run.config, run.data.training
-    photographs = Photographs(dataset, config.background)
+    photographs = Photographs(dataset, run.background)
     for message in photographs.messages:
         run.say(message)
     schedule = make_schedule_of(run, photographs)
     announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
     splats, distance = start_splats(run, photographs, schedule.most)
-    return SplatTrainer(photographs, splats, config.splats, schedule, distance, config.background, config.seed)
+    return SplatTrainer(photographs, splats, config.splats, schedule, distance, run.background, config.seed)
 
 
 def announce(run: Run, memory: str) -> None:
@@ -160,7 +168,7 @@ def optimise(run: Run, phase: Phase) -> None:
             if phase.stage != stage:
                 run.enter_stage(phase)
             if run.checkpoint_due():
-                run.save(phase)
+                run.save_if_possible(phase)
     if phase.stages_left:
         run.say(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
 
@@ -170,7 +178,7 @@ def start_from_field(run: Run) -> Octree:
     from nerfvol.starts.field import distill
     from nerfvol.training.field_trainer import FieldTrainer
 
-    config, background, data = run.config, run.config.background, run.data
+    config, background, data = run.config, run.background, run.data
     ops.set_threads(ops.get_threads())  # torch was loaded only now
     field = FieldTrainer(data.training, config.field, config.seed, background)
     optimise(run, field)
@@ -185,7 +193,8 @@ def start_from_field(run: Run) -> Octree:
         run.say(message)
     run.say(str(report))
     distilled = OctreeModel(octree, run.metadata())
-    written = distilled.save(run.folder / run_folder.DISTILLED, config.storage)
+    in_units = OctreeModel(run.data.frame.octree_back(copy.copy(octree)), run.metadata())
+    written = in_units.save(run.folder / run_folder.DISTILLED, config.storage)
     run.results["distilled"] = {"seconds": time.perf_counter() - started, "leaves": octree.n_leaves,
                                 "MB": written / 1e6, "lost_on_training_views_db": report.lost_db}  # fmt: skip
     run.results["field"] |= summary(score_views(field.picture, data.compared, background))
@@ -198,18 +207,21 @@ def finish(run: Run, trained: list[Model]) -> Results:
     run.claim(None)
     config, seconds = run.config, run.phase_seconds()
     path = run.folder / PRODUCT[config.representation]
-    written = trained.pop().save(path, config.storage)
+    written = run.in_scene_units(trained.pop()).save(path, config.storage)
     return_free_memory()
     model = load_model(path)
-    scores = evaluate(model, run.data.held_out, config.background)
+    frame = run.data.frame
+    scores = evaluate(model, frame.dataset_back(run.data.held_out), run.background)
     counts = _counts(model)
     row = {"seconds": seconds, "steps": run.steps[model.kind], "MB": written / 1e6, **counts}
     if run.results:
-        run.results["fine_tuned"] = row | summary(evaluate(model, run.data.compared, config.background))
+        run.results["fine_tuned"] = row | summary(
+            evaluate(model, frame.dataset_back(run.data.compared), run.background)
+        )
     lens = run.data.held_out.cameras[-1].intrinsics
     metrics = {
         **summary(scores), "n_images": len(scores["rows"]), "split": "val", "image_size": [lens.width, lens.height],
-        "background": list(config.background), "downscale": config.downscale, "seconds": run.clock.elapsed(),
+        "background": list(run.background), "downscale": config.downscale, "seconds": run.clock.elapsed(),
         "steps": run.steps, "representation": model.kind, **counts, "MB": written / 1e6,
         "storage": config.storage, "init": config.init, "seed": config.seed, "time_budget": config.time_budget,
         "data": config.data, "threads": ops.get_threads(), "hardware": describe_hardware(),

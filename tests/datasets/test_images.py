@@ -141,7 +141,7 @@ def damaged(kind, tmp_path):
 
 @pytest.mark.parametrize("kind,sentence", [
     ("truncated", "damaged or truncated"), ("header only", "content is none"), ("flipped bits", "damaged"),
-    ("text", "expected a PNG or JPEG"), ("empty", "expected a PNG or JPEG"), ("folder", "is a folder"),
+    ("text", "expected a PNG, JPEG"), ("empty", "expected a PNG, JPEG"), ("folder", "is a folder"),
     ("missing", "no such file"), ("bomb", "million pixels are refused"), ("float", "8 or 16 bits"),
 ])  # fmt: skip
 def test_unusable_files_are_refused_in_one_sentence(tmp_path, kind, sentence):

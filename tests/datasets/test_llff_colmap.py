@@ -101,9 +101,9 @@ def test_poses_that_do_not_fit_the_points_of_the_model_are_doubted(tmp_path, tex
     edge = 0.5 * min(k.width / k.fx, k.height / k.fy) * 4.0  # at the ring's middle, 4 away
     places = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3)) * edge
     scenes.write_colmap(tmp_path, cameras, scenes.random_images(), text=text, model="PINHOLE")
-    assert len(load_dataset(tmp_path).messages) == 2
+    before = load_dataset(tmp_path).messages
     scenes.write_points(tmp_path, cameras, places, text=text)
-    assert len(load_dataset(tmp_path).messages) == 2
+    assert load_dataset(tmp_path).messages == before and not any("not the poses" in message for message in before)
     for away in (np.diag([-1.0, 1, -1, 1]), np.diag([1.0, -1, -1, 1])):
         turned = [replace(c, c2w=c.c2w @ away) if i % 9 < 5 else c for i, c in enumerate(cameras)]
         scenes.write_colmap(tmp_path, turned, scenes.random_images(), text=text, model="PINHOLE")
@@ -184,7 +184,6 @@ def edit(path, change):
     ("images.bin", lambda d: d[:72] + b"\xff" + d[73:], "no text"),
     ("images.bin", lambda d: d[:12] + struct.pack("<d", 3.0) + d[20:], "unit quaternion"),
     ("images.bin", lambda d: d[:12] + struct.pack("<d", 1e200) + d[20:], "unit quaternion"),
-    ("images.bin", lambda d: d[:44] + struct.pack("<d", np.nan) + d[52:], "finite translation"),
     ("images.bin", lambda d: d[:68] + struct.pack("<i", 99) + d[72:], "camera 99 is not in the model"),
     ("images.bin", lambda d: struct.pack("<Q", 0), "holds no images"),
     ("cameras.bin", lambda d: d[:20], "truncated"),
@@ -228,10 +227,10 @@ def rows(folder):
 @pytest.mark.parametrize("make,sentence", [
     (lambda r: r[:5], "holds 5 poses, but images_4 holds 9 images"),
     (lambda r: r[:, :16], r"shape \(views, 17\), got \(9, 16\)"),
-    (lambda r: np.where(r == r[2, 3], np.nan, r), "finite"),
+    (lambda r: np.where(np.arange(9)[:, None] < 5, np.nan, 1.0) * r, "finite"),
     (lambda r: r.astype(complex), "floating-point"),
     (lambda r: np.concatenate([r[:, :15], r[:, 16:], r[:, 15:16]], axis=1), "0 < near < far"),
-    (lambda r: np.concatenate([2 * r[:, :3], r[:, 3:]], axis=1), "rigid"),
+    (lambda r: np.concatenate([r[:, :1] + r[:, 1:2], r[:, 1:]], axis=1), "rigid"),
     (lambda r: np.array([{"a": 1}]), "cannot be read"),
 ])  # fmt: skip
 def test_damaged_llff_poses_are_refused(tmp_path, make, sentence):

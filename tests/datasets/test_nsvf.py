@@ -36,7 +36,7 @@ def test_names_make_the_splits(tmp_path):
         dataset = load_dataset(tmp_path, split)
         assert len(dataset) == 3 and all(name.startswith(prefix) for name in dataset.names)
         np.testing.assert_array_equal(dataset.scene.aabb, np.reshape(BOX, (2, 3)))
-        assert dataset.messages == ["scene bounds: the aabb of the file"]
+        assert dataset.messages[-1] == "scene bounds: the aabb of the file" and len(dataset.messages) == 2
 
 
 @pytest.mark.parametrize("prefix,missing", [("1_", "test"), ("2_", "val")])
@@ -68,7 +68,7 @@ def test_the_ways_to_write_intrinsics(tmp_path, text):
     ("intrinsics.txt", "-30 0 12\n0 30 8\n0 0 1", "focal lengths must be positive"),
     ("intrinsics.txt", "nan 0 12\n0 30 8\n0 0 1", "fx must be a finite number"),
     ("pose/0_view_003.txt", "1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1", r"got 4 rows of \[3, 4\] numbers"),
-    ("pose/0_view_003.txt", "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1", "0_view_003.txt: a camera pose must be rigid"),
+    ("pose/0_view_003.txt", "1 1 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1", "0_view_003.txt: a camera pose must be rigid"),
     ("pose/0_view_003.txt", "1 0 0\n0 1 0\n0 0 1", r"must be a 4x4 \(or 3x4\) matrix, got shape \(3, 3\)"),
     ("bbox.txt", "0 0 0 1 1", "bbox.txt: the box must be two corners"),
     ("bbox.txt", "0 0 0 1 1 -1 0.4", "bbox.txt: the box must be finite with its first corner below"),

@@ -135,7 +135,10 @@ def test_the_last_stage_has_more_bands(tiny_scene):
         ("levels=[5, 40]", f"levels: expected a number from 1 to {MAX_LEVEL}, got 40"),
         ("tiles=[0]", "tiles: expected a number from 1 to 1048576, got 0"),
         ("tiles=[8]", "tiles must have one entry per stage, as many as octree.levels (7), got 1"),
-        ("until=[1.0]", "until was renamed to octree.stage_ends"),
+        (
+            "coverage=0.5",
+            "coverage is no longer a setting: pruning always waits until half of the foreground tiles were seen",
+        ),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(tiny_scene, tmp_path, command, setting, expected):
