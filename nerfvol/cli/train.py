@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerfvol.cli.command import Command, assemble_options, need, set_threads
+from nerfvol.cli.command import FITTED, Command, assemble_options, need, set_threads
+from nerfvol.cli.photographs import with_poses
 from nerfvol.config.assemble import read_yaml
 from nerfvol.config.training import Config
 from nerfvol.datasets.formats import formats_help
@@ -34,6 +35,10 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
     p.add_argument("--aabb", metavar="X0,Y0,Z0,X1,Y1,Z1", help="the region of detail in the units of the poses: lowest "
                    "and highest corner (default: worked out from the cameras)")  # fmt: skip
+    p.add_argument("--poses", metavar="given|auto", help="auto: photographs without poses, or a video, get them first, in "
+                   "RUN/scene (needs nerfvol[poses]; default: given)")  # fmt: skip
+    p.add_argument("--appearance", metavar="auto|on|off", help="a colour map for each photograph; auto: where exposures "
+                   "differ by more than 2 %% (default: auto)")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")
@@ -60,6 +65,7 @@ def run(given: dict[str, Any]) -> int:
     need("train", data=config.data, out=config.out)
     if not Path(config.data).exists():
         raise InputError(f"--data {config.data}: no such folder or file")
+    config = with_poses(config)
     set_threads(config.threads)
     from nerfvol.training.train import train
 
@@ -82,6 +88,8 @@ def print_results(results: Results) -> None:
     print(f"\n{metrics['n_images']} held-out views on background {background}: PSNR {metrics['psnr']:.2f} dB, "
           f"SSIM {metrics['ssim']:.4f}; {results.size}, {metrics['MB']:.1f} MB, "
           f"{metrics['seconds_per_frame']:.3f} s per frame, {metrics['seconds']:.0f} s in all")  # fmt: skip
+    if "psnr_fitted" in metrics:
+        print(FITTED.format(metrics["psnr_fitted"], metrics["ssim_fitted"]))
     print(f"model: {results.model}")
 
 

@@ -91,5 +91,3 @@ def run_engine(job: Job, progress: Progress) -> dict[str, Any]:
         last = lines[-1].split("] ", 1)[-1] if lines else f"exit code {code}"
         raise InputError(f"structure from motion stopped: {last:.200} (all it said: {log})")
     return read_json(work / RESULT)
-
-

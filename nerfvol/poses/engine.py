@@ -70,7 +70,13 @@ def run(job: Job, report: Report) -> dict[str, Any]:
     with _Timed(seconds, "matching"):
         how = match(job, report)
     counts, links, motion = look(job)
-    result: dict[str, Any] = {"pairs": how, "features": counts, "links": links, "motion": motion, "pycolmap": pycolmap.__version__}
+    result: dict[str, Any] = {
+        "pairs": how,
+        "features": counts,
+        "links": links,
+        "motion": motion,
+        "pycolmap": pycolmap.__version__,
+    }
     placed: list[str] = []
     tried = {}
     if links:

@@ -19,6 +19,7 @@ from nerfvol.datasets.images import map_threads
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import ensure_writable_folder, read_json, write_json
 from nerfvol.machine import describe_hardware
+from nerfvol.measure.sharpness import sharpness
 from nerfvol.poses import sources, video
 from nerfvol.poses.child import Progress, require_pycolmap, run_engine
 from nerfvol.poses.engine import MODEL, Job
@@ -136,7 +137,9 @@ def gather(
         chosen = video.choose_frames(judged, settings.frames)
         n = len(judged.sharpness)
         if len(chosen) < 3:
-            raise InputError(f"{path}: nothing moves in the video's {n} frames; walk around the subject while it records")
+            raise InputError(
+                f"{path}: nothing moves in the video's {n} frames; walk around the subject while it records"
+            )
         video.write_frames(path, chosen, images, settings.size)
         paths = sorted(images.iterdir())
         photographs, bad = sources.copy_photographs(paths, images, settings.size)
@@ -146,13 +149,19 @@ def gather(
     else:
         paths = sources.find_photographs(path)
         photographs, bad = sources.copy_photographs(paths, images, settings.size)
-        some = [photographs[i] for i in np.unique(np.linspace(0, len(photographs) - 1, 16).round().astype(int))] if photographs else []
+        some = (
+            [photographs[i] for i in np.unique(np.linspace(0, len(photographs) - 1, 16).round().astype(int))]
+            if photographs
+            else []
+        )
         sharp = float(np.median(map_threads(lambda p: picture_sharpness(images / p.name), some))) if some else 0.0
         record = {"sharpness": sharp}
     bar.at("frames", 1, 1)
     messages += bad
     if len(photographs) < 3:
-        raise InputError(f"{path}: fewer than three of its pictures can be read; {bad[0] if bad else 'it holds too few'}")
+        raise InputError(
+            f"{path}: fewer than three of its pictures can be read; {bad[0] if bad else 'it holds too few'}"
+        )
     write_json(listed, {"photographs": [asdict(p) for p in photographs], "record": record})
     return photographs, record, messages
 
@@ -166,7 +175,7 @@ def picture_sharpness(path: Path) -> float:
         grey = image.convert("L")
         scale = min(1.0, video.JUDGED_SIZE / max(grey.size))
         size = [max(8, round(side * scale)) for side in grey.size]
-        return video.sharpness(np.asarray(grey.resize((size[0], size[1]), Image.Resampling.BOX)))
+        return sharpness(np.asarray(grey.resize((size[0], size[1]), Image.Resampling.BOX)))
 
 
 def finished(folder: Path, mark: dict[str, Any] | None = None) -> dict[str, Any] | None:

@@ -52,7 +52,7 @@ def turning(result: dict[str, Any]) -> bool:
 def failure(result: dict[str, Any], names: Sequence[str], sharpness: float | None = None) -> str | None:
     """Why the photographs gave no usable cameras, one sentence; None where at least half of them were placed.
 
-    ``result``: of the engine. ``names``: all photographs. ``sharpness``: median of the pictures (poses.video.sharpness), or
+    ``result``: of the engine. ``names``: all photographs. ``sharpness``: median of the pictures (measure.sharpness), or
     None where it was not looked at.
     """
     n, placed = len(names), result["registered"]
@@ -87,7 +87,7 @@ def failure(result: dict[str, Any], names: Sequence[str], sharpness: float | Non
 
 
 BLURRED = 0.12
-"""Sharpness (poses.video.sharpness) of thumbnails below which a picture is blurred by some four pixels of them."""
+"""Sharpness (measure.sharpness) of thumbnails below which a picture is blurred by some four pixels of them."""
 
 
 def remarks(result: dict[str, Any], names: Sequence[str]) -> list[str]:

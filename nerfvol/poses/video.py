@@ -1,8 +1,6 @@
 """Which frames of a video to take: the sharpest of each part of its time, none where nothing moves.
 
-Two passes through ffmpeg: small grey frames to judge, then the chosen ones at full size. Sharpness of a frame is the mean
-squared Laplacian over the mean squared gradient: the mean squared frequency of its edges, which motion blur lowers and
-contrast does not change.
+Two passes through ffmpeg: small grey frames to judge, then the chosen ones at full size.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.measure.sharpness import sharpness
 
 JUDGED_SIZE = 320
 """Pixels along the longer side of the frames that are judged."""
@@ -33,16 +32,6 @@ class Judged:
 
     sharpness: NDArray[np.float32]
     thumbnails: NDArray[np.uint8]
-
-
-def sharpness(grey: NDArray[np.uint8]) -> float:
-    """Mean squared Laplacian over mean squared gradient of a grey picture (h, w); 0 where it is uniform."""
-    g = grey.astype(np.float32)
-    middle = g[1:-1, 1:-1]
-    laplacian = g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:] - 4 * middle
-    across, down = (g[1:-1, 2:] - g[1:-1, :-2]) / 2, (g[2:, 1:-1] - g[:-2, 1:-1]) / 2
-    slope = float((across * across + down * down).mean())
-    return float((laplacian * laplacian).mean()) / slope if slope > 1e-6 else 0.0
 
 
 def judge_video(path: Path, on_frame: Callable[[int], object] = lambda n: None) -> Judged:

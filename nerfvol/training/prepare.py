@@ -19,7 +19,7 @@ from nerfvol.datasets.images import composite_average
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import ensure_writable_folder, explain_os_error
-from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, PREVIOUS, PRODUCTS
+from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, PHOTOGRAPHS, PREVIOUS, PRODUCTS
 
 HELD_OUT_KEPT = 32 << 20
 """Bytes of held-out images that a run keeps; more are read once again to be scored."""
@@ -27,8 +27,8 @@ COMPARED_SIZE = 200
 """Pixels along the middle of a held-out view on which field and octrees are compared: a field takes seconds for so many."""
 LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
-_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG)
-_FREE = {"data", "out", "time_budget", "threads", "resume", "checkpoint_every", "storage", "compare_views"}
+_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG, PHOTOGRAPHS)
+_FREE = {"data", "poses", "out", "time_budget", "threads", "resume", "checkpoint_every", "storage", "compare_views"}
 """Settings that a resumed run may change; all others have already shaped its numbers."""
 
 
