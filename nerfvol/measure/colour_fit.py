@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Map = NDArray[np.float64]
-RIDGE = 3e-3
+RIDGE = 1e-2
 """Weight of a map's distance to a mere gain, per pixel: what the pixels say little of stays a gain."""
 SATURATED = 252 / 255
 """A channel from here on may have been more."""

@@ -91,7 +91,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """What :func:`score_views` returns of ``model``, drawn as ``nerfvol render`` draws it (see models.Model.render).
 
-    Models of photographs whose exposure differed are scored after a colour fit as well. ``background``: (3,) in [0, 1]. ``on_view(index, truth, render)`` sees each pair, both (H, W, 3) float32 in [0, 1].
+    Models of photographs whose exposure differed are scored after a colour fit as well. ``background``: (3,) in [0, 1].
+    ``on_view(index, truth, render)`` sees each pair, both (H, W, 3) float32 in [0, 1].
     """
 
     def render(camera: Camera) -> Float:

@@ -97,9 +97,10 @@ def copy_photographs(paths: list[Path], folder: Path, size: int) -> tuple[list[P
     taken: set[str] = set()
     names = []
     for path in paths:
-        name = path.name if path.name.lower() not in taken else f"{path.stem}_{path.suffix[1:]}{path.suffix}"
+        # Copies may become JPEG, so that names must differ before their endings.
+        name = path.name if path.stem.lower() not in taken else f"{path.stem}_{path.suffix[1:]}{path.suffix}"
         names.append(name)
-        taken.add(name.lower())
+        taken.add(Path(name).stem.lower())
 
     def copy(pair: tuple[Path, str]) -> Photograph | str:
         try:

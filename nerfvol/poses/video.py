@@ -82,11 +82,9 @@ def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list
     with tempfile.TemporaryDirectory(dir=folder, prefix=".frames") as temporary:
         select = "+".join(f"eq(n\\,{number})" for number in chosen)
         fit = f"scale='min({size},iw)':'min({size},ih)':force_original_aspect_ratio=decrease:flags=lanczos"
-        script = Path(temporary) / "filter.txt"  # a hundred numbers are too long for some command lines
-        script.write_text(f"select='{select}',{fit}")
         out = ["-fps_mode", "passthrough", "-q:v", "2", "-f", "image2", str(Path(temporary) / "%05d.jpg")]
         result = subprocess.run(
-            [*_ffmpeg(path), "-filter_script:v", str(script), *out], capture_output=True, stdin=subprocess.DEVNULL
+            [*_ffmpeg(path), "-vf", f"select='{select}',{fit}", *out], capture_output=True, stdin=subprocess.DEVNULL
         )
         made = sorted(Path(temporary).glob("*.jpg"))
         if result.returncode or len(made) != len(chosen):
