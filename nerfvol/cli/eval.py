@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from nerfvol import __version__
-from nerfvol.cli.command import Command, add_drawing, add_target, need, prepare_outputs, set_threads
+from nerfvol.cli.command import FITTED, Command, add_drawing, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
 from nerfvol.config.values import Colour, Count, fraction, pixels
@@ -142,6 +142,7 @@ def _record(
     return {
         "psnr": scores["psnr"],
         "ssim": scores["ssim"],
+        **{name: scores[name] for name in ("psnr_fitted", "ssim_fitted") if name in scores},
         "n_images": len(scores["rows"]),
         "seconds_per_frame": scores["seconds_per_frame"],
         "image_size": list(sizes[-1]),
@@ -177,6 +178,8 @@ def _print_scores(record: dict[str, Any], split: str) -> None:
         f"PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}{distance}, {record['seconds_per_frame']:.3f} s per frame "
         f"({record['threads']} threads, {record['kernel_path']})"
     )
+    if "psnr_fitted" in record:
+        print(FITTED.format(record["psnr_fitted"], record["ssim_fitted"]))
 
 
 COMMAND = Command(

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerfvol.cli.command import Command, assemble_options, need, set_threads
+from nerfvol.cli.command import FITTED, Command, assemble_options, need, set_threads
+from nerfvol.cli.photographs import with_poses
 from nerfvol.cli.terminal import go_on_without_reader
 from nerfvol.config.assemble import read_yaml
 from nerfvol.config.training import Config
@@ -39,6 +40,10 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "arc: an eighth of the training views, next to each other, which asks for more (default: own)")  # fmt: skip
     p.add_argument("--scene", metavar="KIND", help="auto, object (before nothing or a plain backdrop), surroundings (around a "
                    "subject), room (seen from inside) or forward (all look one way) (default: auto)")  # fmt: skip
+    p.add_argument("--poses", metavar="given|auto", help="auto: photographs without poses, or a video, get them first, in "
+                   "RUN/scene (needs nerfvol[poses]; default: given)")  # fmt: skip
+    p.add_argument("--appearance", metavar="auto|on|off", help="a colour map for each photograph; auto: where exposures "
+                   "differ by more than 2 %% (default: auto)")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")
@@ -65,6 +70,7 @@ def run(given: dict[str, Any]) -> int:
     need("train", data=config.data, out=config.out)
     if not Path(config.data).exists():
         raise InputError(f"--data {config.data}: no such folder or file")
+    config = with_poses(config)
     set_threads(config.threads)
     go_on_without_reader()
     from nerfvol.training.train import train
@@ -88,6 +94,8 @@ def print_results(results: Results) -> None:
     print(f"\n{metrics['n_images']} held-out views on background {background}: PSNR {metrics['psnr']:.2f} dB, "
           f"SSIM {metrics['ssim']:.4f}; {results.size}, {metrics['MB']:.1f} MB, "
           f"{metrics['seconds_per_frame']:.3f} s per frame, {metrics['seconds']:.0f} s in all")  # fmt: skip
+    if "psnr_fitted" in metrics:
+        print(FITTED.format(metrics["psnr_fitted"], metrics["ssim_fitted"]))
     print(f"model: {results.model}")
 
 

@@ -45,3 +45,25 @@ class ImageStore(Sequence[UInt8]):
 
     def __iter__(self) -> Iterator[UInt8]:
         return iter(self.get())
+
+
+class Corrected(Sequence[UInt8]):
+    """Another sequence's images, each through ``change(index, image)`` when it is asked for; nothing is kept."""
+
+    def __init__(self, images: Sequence[UInt8], change: Callable[[int, UInt8], UInt8]) -> None:
+        self._images, self._change = images, change
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    @overload
+    def __getitem__(self, index: int) -> UInt8: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[UInt8]: ...
+    def __getitem__(self, index: int | slice) -> UInt8 | list[UInt8]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return self._change(index, self._images[index])
+
+    def __iter__(self) -> Iterator[UInt8]:
+        return (self[i] for i in range(len(self)))

@@ -15,6 +15,7 @@ PRODUCTS = (OCTREE, SPLATS)
 CHECKPOINT = "checkpoint.safetensors"
 DISTILLED = "distilled.safetensors"
 METRICS = "metrics.json"
+PHOTOGRAPHS = "photographs.csv"
 LOG = "log.jsonl"
 PREVIEWS = "previews"
 PREVIOUS = "previous"

@@ -18,12 +18,16 @@ from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 from nerfvol.files import pictures
 from nerfvol.kernels import ops
+from nerfvol.measure.colour_fit import apply_map, fit_colour_map
 from nerfvol.measure.metrics import psnr, ssim
 from nerfvol.models import Model
 from nerfvol.views import depth_range, surface_depth
 
 LARGEST_PSNR = 100.0
 """Equal images have infinite PSNR, which JSON cannot say; an 8-bit image has 100 dB only where it is equal."""
+
+COLOUR_MAPS = "colour_maps"
+"""Key of a model's metadata: whether photographs were mapped to one exposure."""
 
 Float = NDArray[np.float32]
 
@@ -33,24 +37,33 @@ def score_views(
     dataset: Dataset,
     background: Sequence[float],
     on_view: Callable[[int, Float, Float], None] | None = None,
+    colour_fit: bool = False,
 ) -> dict[str, Any]:
     """Scores of ``render`` (camera -> (H, W, 3) float32) against every image of ``dataset`` over ``background``.
 
     Returns psnr and ssim (means of the per-view values), seconds_per_frame (median) and rows with name, psnr, ssim and
     seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that masks leave out,
-    or that the lens does not reach, take no part; views of which nothing is left have no row.
+    or that the lens does not reach, take no part; views of which nothing is left have no row. ``colour_fit``: also
+    psnr_fitted and ssim_fitted, of the render after the colour map that brings it nearest to the photograph
+    (measure.colour_fit): without what the camera's exposure and white balance do.
     """
 
     def score(rendered: tuple[int, Float, float]) -> dict[str, Any]:
         index, image, seconds = rendered
         truth = dataset.composited(index, background)
         seen = _seen(dataset, index)
-        return {
+        row = {
             "name": dataset.names[index],
             "psnr": min(psnr(image, truth) if seen is None else psnr(image[seen], truth[seen]), LARGEST_PSNR),
             "ssim": ssim(image, truth, seen),
             "seconds": seconds,
         }
+        if colour_fit:
+            colours = fit_colour_map(image, truth) if seen is None else fit_colour_map(image[seen], truth[seen])
+            fitted = np.clip(apply_map(colours, image), 0, 1)
+            after = psnr(fitted, truth) if seen is None else psnr(fitted[seen], truth[seen])
+            row |= {"psnr_fitted": min(after, LARGEST_PSNR), "ssim_fitted": ssim(fitted, truth, seen)}
+        return row
 
     rows, at_once = [], ops.get_threads()
     scored = [i for i in range(len(dataset)) if (seen := _seen(dataset, i)) is None or seen.any()]
@@ -68,9 +81,9 @@ def score_views(
         if on_view is not None:
             for index, image, _ in few:
                 on_view(index, dataset.composited(index, background), image)
+    means = ("psnr", "ssim", *(("psnr_fitted", "ssim_fitted") if colour_fit else ()))
     return {
-        "psnr": statistics.fmean(row["psnr"] for row in rows),
-        "ssim": statistics.fmean(row["ssim"] for row in rows),
+        **{name: statistics.fmean(row[name] for row in rows) for name in means},
         "seconds_per_frame": statistics.median(row["seconds"] for row in rows),
         "rows": rows,
     }
@@ -92,13 +105,19 @@ def evaluate(
 ) -> dict[str, Any]:
     """What :func:`score_views` returns of ``model``, drawn as ``nerfvol render`` draws it (see models.Model.render).
 
-    ``background``: (3,) in [0, 1]. ``on_view(index, truth, render)`` sees each pair, both (H, W, 3) float32 in [0, 1].
+    Models of photographs whose exposure differed are scored after a colour fit as well. ``background``: (3,) in [0, 1].
+    ``on_view(index, truth, render)`` sees each pair, both (H, W, 3) float32 in [0, 1].
     """
 
     def render(camera: Camera) -> Float:
         return model.render(camera, background, ("rgb",), early_stop_eps, lod)["rgb"]
 
-    return score_views(render, dataset, background, on_view)
+    return score_views(render, dataset, background, on_view, has_colour_maps(model))
+
+
+def has_colour_maps(model: Model) -> bool:
+    """Whether a model was trained on photographs that were mapped to one exposure (training.appearance)."""
+    return bool(getattr(model, "metadata", {}).get(COLOUR_MAPS))
 
 
 def comparison_writer(

@@ -19,6 +19,7 @@ from typing import Any
 
 from nerfvol.config.assemble import assemble, read_yaml, run_settings, to_plain
 from nerfvol.config.training import Config
+from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json, write_text
 from nerfvol.files.run_folder import CHECKPOINT, CONFIG, METRICS
@@ -115,10 +116,11 @@ def draw(folder: str) -> None:
     from nerfvol.files import pictures
     from nerfvol.models import load_model
 
-    settings = assemble(Config, (run_settings(folder), CONFIG))
-    dataset = load_dataset(settings.data, "val", settings.downscale).evenly(1)
-    truth = dataset.composited(0, settings.background)
-    image = load_model(folder).render(dataset.cameras[0], settings.background)["rgb"]
+    settings, model = assemble(Config, (run_settings(folder), CONFIG)), load_model(folder)
+    background = model.metadata.get("background", WHITE)
+    dataset = load_dataset(settings.data, "val", settings.downscale, holdout=settings.holdout, scene=settings.scene).evenly(1)
+    truth = dataset.composited(0, background)
+    image = model.render(dataset.cameras[0], background)["rgb"]
     pictures.write_png(Path(folder) / PICTURE, np.concatenate([truth, np.clip(image, 0, 1)], 1))
 
 

@@ -17,6 +17,8 @@ import numpy as np
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import OctreeConfig, SceneChoices
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import area_average
+from nerfvol.datasets.store import Corrected
 from nerfvol.datasets.tiles import Cursors, TileBank
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
@@ -26,6 +28,7 @@ from nerfvol.octree.topology import Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 from nerfvol.starts.fog import low_density_octree
+from nerfvol.training.appearance import Appearance, fitting_factor
 from nerfvol.training.memory import OctreePlan, splits_within
 from nerfvol.views import OctreeModel, render_image
 
@@ -50,6 +53,8 @@ BETA = 0.98
 """Memory, per step, of RMSprop's second moments."""
 FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
 """At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
+OPAQUE = 0.999
+"""Pixels with transparency whose colour is the thing's alone: these have a colour map fitted."""
 FINAL_TILES = 4096
 """Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
 
@@ -73,9 +78,11 @@ class OctreeTrainer:
         seed: int = 0,
         octree: Octree | None = None,
         plan: OctreePlan | None = None,
+        appearance: Appearance | None = None,
     ):
         config, self.chosen = config.for_scene(dataset.scene), SceneChoices.of(config, dataset.scene)
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
+        self.appearance = appearance or Appearance(len(dataset), "off")
         self.octree = octree if octree is not None else self._low_density_start()
         self.state = ops.TrainState(self.octree)
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
@@ -120,7 +127,8 @@ class OctreeTrainer:
 
     def needs_images(self) -> bool:
         """Until the tiles at hand serve to the end."""
-        return self.bank is None or len(set(self.config.downscales[self.stage :])) > 1
+        more_stages = len(set(self.config.downscales[self.stage :])) > 1
+        return self.bank is None or more_stages or self.appearance.may_change
 
     def outgrown(self) -> str | None:
         """See Phase."""
@@ -148,7 +156,7 @@ class OctreeTrainer:
             "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
             "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
             "prunings": self.prunings, "tiles_seen": self.tiles_seen,
-            "cursors": dataclasses.asdict(self.cursors),
+            "cursors": dataclasses.asdict(self.cursors), "appearance": self.appearance.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict) -> None:
@@ -173,6 +181,7 @@ class OctreeTrainer:
         for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
         self.cursors = Cursors.of(state["cursors"])
+        self.appearance.load_state_dict(state["appearance"])
         # The bank says when enough was seen to prune: where there was one, there must be one at once.
         self.bank = None if self.steps_done == 0 else self._make_bank()
 
@@ -184,6 +193,8 @@ class OctreeTrainer:
             if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
                 self.next_stage()
         self._prune_inside_stage(progress)
+        if self.appearance.due(progress) and self.fit_appearance(progress):
+            self.bank = None
         if self.bank is None:
             self.bank = self._make_bank()
         fade = c.regulariser_decay**progress
@@ -218,7 +229,24 @@ class OctreeTrainer:
         return tuple(random.random(3).tolist())
 
     def _make_bank(self) -> TileBank:
-        return TileBank(self.dataset, self.background, self.config.downscales[self.stage])
+        dataset, seen = self.dataset, self.appearance
+        if seen.active:
+            images = Corrected(dataset.images, seen.corrected_colours)
+            dataset = dataclasses.replace(dataset, images=images)
+        return TileBank(dataset, self.background, self.config.downscales[self.stage])
+
+    def fit_appearance(self, progress: float) -> bool:
+        """Fits the photographs' colour maps to what the octree shows of small pictures of them; whether they are used."""
+        return self.appearance.fit(self.seen, progress)
+
+    def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See FinalPhase."""
+        camera, image = self.dataset.cameras[i], self.dataset.images[i]
+        k = fitting_factor(camera.intrinsics.width, camera.intrinsics.height)
+        small = area_average(image, k).astype(np.float32) / 255
+        shown = self.picture(camera.scaled(k))
+        weight = small[..., 3] > OPAQUE if small.shape[2] == 4 else np.ones(shown.shape[:2])
+        return small[..., :3], shown, weight
 
     def next_stage(self) -> None:
         """Prunes, splits the leaves that the next stage wants finer, and turns to its images."""

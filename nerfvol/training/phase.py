@@ -10,6 +10,7 @@ import numpy as np
 from nerfvol.cameras.camera import Camera
 from nerfvol.kernels.state import StepReport
 from nerfvol.models import Model
+from nerfvol.training.appearance import Appearance
 
 
 class Phase(Protocol):
@@ -91,7 +92,14 @@ class Phase(Protocol):
 
 
 class FinalPhase(Phase, Protocol):
-    """A phase whose product is the run's: the last one."""
+    """A phase whose product is the run's: the last one. ``appearance``: the photographs' colour maps."""
+
+    appearance: Appearance
+
+    def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A small picture of training view i as it was taken (h, w, 3), as the model shows it, both in [0, 1], and the
+        pixels' weights (h, w)."""
+        ...
 
     def take_model(self, metadata: dict[str, Any]) -> Model:
         """The finished model; everything else is released."""

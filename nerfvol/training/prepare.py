@@ -22,7 +22,17 @@ from nerfvol.datasets.load import load_dataset
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import ensure_writable_folder, explain_os_error
-from nerfvol.files.run_folder import CHECKPOINT, CONFIG, DISTILLED, LOG, METRICS, PREVIOUS, PRODUCTS, UNFINISHED
+from nerfvol.files.run_folder import (
+    CHECKPOINT,
+    CONFIG,
+    DISTILLED,
+    LOG,
+    METRICS,
+    PHOTOGRAPHS,
+    PREVIOUS,
+    PRODUCTS,
+    UNFINISHED,
+)
 from nerfvol.starts.region import region_of_sweep
 
 Colour = tuple[float, float, float]
@@ -33,8 +43,8 @@ COMPARED_SIZE = 200
 """Pixels along the middle of a held-out view on which field and octrees are compared: a field takes seconds for so many."""
 LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
-_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG)
-_FREE = {"data", "out", "time_budget", "threads", "resume", "checkpoint_every", "storage", "compare_views"}
+_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG, PHOTOGRAPHS)
+_FREE = {"data", "poses", "out", "time_budget", "threads", "resume", "checkpoint_every", "storage", "compare_views"}
 """Settings that a resumed run may change; all others have already shaped its numbers."""
 
 

@@ -22,6 +22,7 @@ from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatState, vi
 from nerfvol.kernels.state import StepReport
 from nerfvol.splats.packing import LOGIT
 from nerfvol.splats.splats import Splats
+from nerfvol.training.appearance import Appearance, fitting_factor
 from nerfvol.training.splat_schedule import Schedule, saved_schedule
 from nerfvol.views import SplatModel
 
@@ -50,11 +51,14 @@ class SplatTrainer:
         subject_distance: float,
         background: Sequence[float],
         seed: int = 0,
+        appearance: Appearance | None = None,
     ) -> None:
-        """``config`` with a number for each None; ``subject_distance``: the median camera's, scene units."""
+        """``config`` with a number for each None; ``subject_distance``: the median camera's, scene units; ``appearance``: of
+        the photographs (default: they stay as they are)."""
         self.photographs, self.config, self.schedule, self.seed = photographs, config, schedule, seed
         self.background = (float(background[0]), float(background[1]), float(background[2]))
         self.subject_distance = subject_distance
+        self.appearance = appearance or Appearance(len(photographs), "off")
         self.state = SplatState(splats)
         self.started_with = self.state.n
         self.steps = config.steps
@@ -102,6 +106,7 @@ class SplatTrainer:
             "started_with": self.started_with, "steps_of_stages": list(self.schedule.steps),
             "seen_since": self.seen_since, "factors": list(self.schedule.factors), "ends": list(self.schedule.ends),
             "most": self.schedule.most, "grown": self.schedule.grown, "subject_distance": self.subject_distance,
+            "appearance": self.appearance.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -111,6 +116,7 @@ class SplatTrainer:
             setattr(self, name, int(state[name]))
         self.schedule = saved_schedule(state)
         self.subject_distance = float(state["subject_distance"])
+        self.appearance.load_state_dict(state["appearance"])
         if not 0 <= self.stage < len(self.schedule.factors) or min(self.steps_done, self.seen_since) < 0:
             raise ValueError(f"stage {self.stage} and step {self.steps_done} are not in its schedule")
         if min(self.state.n, self.started_with) < 1 or not 0 < self.subject_distance < math.inf:
@@ -124,12 +130,15 @@ class SplatTrainer:
             self.stage, self.stage_began = self.stage + 1, self.steps_done
         if self.steps_done and self.steps_done % self.config.grow_every == 0:
             self.grow(progress)
-        view = self.photographs.view(self._next_view(), self.schedule.factors[self.stage])
+        if self.appearance.due(progress):
+            self.fit_appearance(progress)
+        index = self._next_view()
+        view = self.photographs.view(index, self.schedule.factors[self.stage])
         near = NEAR_SHARE * self.subject_distance
         report = splat_ops.train_step(
             self.state,
             view_of(view.camera, self.state.origin, near),
-            view.image,
+            self.appearance.corrected(index, view.image),
             self._options(),
             self._rates(progress),
         )
@@ -137,6 +146,20 @@ class SplatTrainer:
         self.seen_since += 1
         pixels = view.image.shape[0] * view.image.shape[1]
         return StepReport(report.squared_error, 16 * report.blocks / pixels)
+
+    def fit_appearance(self, progress: float) -> None:
+        """Fits the photographs' colour maps to what the splats show of small pictures of them."""
+        held = self.photographs.held
+        self.appearance.fit(self.seen, progress)
+        for factor in self.photographs.held - held:
+            self.photographs.drop(factor)
+
+    def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See FinalPhase."""
+        canvas = self.photographs.cameras[i].intrinsics
+        view = self.photographs.view(i, fitting_factor(canvas.width, canvas.height))
+        values = view.image.astype(np.float32) / 255
+        return values[..., :3], self.picture(view.camera), values[..., 3]
 
     def _next_view(self) -> int:
         """Seed-shuffled epochs."""

@@ -15,6 +15,7 @@ import copy
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,14 @@ from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.files.lock import only_writer
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
-from nerfvol.measure.scores import evaluate, score_views
+from nerfvol.measure.scores import COLOUR_MAPS, evaluate, score_views
 from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
+from nerfvol.training.appearance import Appearance
 from nerfvol.training.memory import OctreePlan, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
+from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
 from nerfvol.training.session import Clock, Run, Say, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
@@ -47,6 +50,8 @@ WHY = {
     "octree": "an object without surroundings, or asked for by --init",
     "splats": "photographs, which splats draw sharper and sooner, or asked for by --init",
 }
+MakeBar = Callable[[str, float], Any]
+"""A phase's name and what is done of it, 0 to 1 -> a bar with tqdm's ``update`` and ``set_postfix_str``."""
 LOG_EVERY = 50
 """Steps between two lines of the log."""
 
@@ -63,13 +68,16 @@ class Results:
     compared: str
 
 
-def train(config: Config, started: float | None = None, say: Say | None = None) -> Results | None:
+def train(
+    config: Config, started: float | None = None, say: Say | None = None, bar: MakeBar | None = None
+) -> Results | None:
     """One training run as ``config`` says, in the folder ``config.out``.
 
     Args:
         config: all settings; with ``resume`` the run goes on from its checkpoint.
         started: moment (``time.perf_counter``) at which the time budget begins; default: the start of the process.
         say: gets each sentence that a person should see; default: prints it.
+        bar: makes what shows the progress of a phase, from its name and what is done of it; default: :func:`progress_bar`.
 
     Returns:
         what the run came to; None where a resumed run was finished already.
@@ -83,14 +91,14 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
     out = check_folder(config)
     try:
         with only_writer(out, "trains"):
-            return _train(config, out, started, say)
+            return _train(config, out, started, say, bar)
     except InputError:
         with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays
             out.rmdir()
         raise
 
 
-def _train(config: Config, out: Path, started: float | None, say: Say) -> Results | None:
+def _train(config: Config, out: Path, started: float | None, say: Say, bar: MakeBar | None) -> Results | None:
     saved = read_saved(out / run_folder.CHECKPOINT) if config.resume else None
     if saved is not None and saved["phase"] == "done":
         say(f"{out} is finished ({saved['steps']} steps), there is nothing to resume; its settings can be run again "
@@ -102,8 +110,14 @@ def _train(config: Config, out: Path, started: float | None, say: Say) -> Result
     run = Run(config, data, clock, saved, say)
     with run.interruptible(), run:
         phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
-        optimise(run, phase)
-        trained: list[Model] = [phase.take_model(run.metadata())]
+        optimise(run, phase, bar)
+        appearance = phase.appearance
+        if data.training.scene.is_unbounded:
+            run.say(write_table(run.folder / run_folder.PHOTOGRAPHS, data.training, phase))
+        if appearance.active:
+            run.say(appearance.sentence())
+        metadata = {COLOUR_MAPS: True} if appearance.active else {}
+        trained: list[Model] = [phase.take_model(run.metadata() | metadata)]
         del phase
         return finish(run, trained)
 
@@ -115,7 +129,7 @@ def begin_octree(run: Run) -> OctreeTrainer:
     plan = OctreePlan(config, data.training, data.held_out_bytes)
     announce(run, plan.sentence())
     octree = start_from_field(run) if config.init == "mlp" and run.phase in ("start", "field") else None
-    return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan)
+    return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan, appearance_of(run))
 
 
 def begin_splats(run: Run) -> SplatTrainer:
@@ -129,7 +143,17 @@ def begin_splats(run: Run) -> SplatTrainer:
     schedule = make_schedule_of(run, photographs)
     announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
     splats, distance = start_splats(run, photographs, schedule.most)
-    return SplatTrainer(photographs, splats, config.splats, schedule, distance, run.background, config.seed)
+    return SplatTrainer(
+        photographs, splats, config.splats, schedule, distance, run.background, config.seed, appearance_of(run)
+    )
+
+
+def appearance_of(run: Run) -> Appearance:
+    """The colour maps of the run's photographs. Objects in front of a background that is painted into their pictures have
+    none: a map would change the background too, and nobody knows where it ends."""
+    dataset = run.data.training
+    mapped = dataset.scene.is_unbounded or dataset.images[0].shape[2] == 4
+    return Appearance(len(dataset), run.config.appearance if mapped else "off")
 
 
 def announce(run: Run, memory: str) -> None:
@@ -144,11 +168,11 @@ def announce(run: Run, memory: str) -> None:
 
 
 # ------------------------------------------------------------------ the loop
-def optimise(run: Run, phase: Phase) -> None:
+def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
     """Steps until the phase is over, with all that goes on around them."""
     run.enter(phase)
     progress = run.progress(phase)
-    with progress_bar(phase.name, progress) as bar:
+    with (make_bar or progress_bar)(phase.name, progress) as bar:
         while progress < 1:
             stage = phase.stage
             report = phase.step(progress)
@@ -250,4 +274,5 @@ def progress_bar(name: str, done: float) -> tqdm[Any]:
 
 def summary(scores: dict[str, Any]) -> dict[str, Any]:
     """Means of the scores, without the rows."""
-    return {key: scores[key] for key in ("psnr", "ssim", "seconds_per_frame")}
+    keys = ("psnr", "ssim", "psnr_fitted", "ssim_fitted", "seconds_per_frame")
+    return {key: scores[key] for key in keys if key in scores}

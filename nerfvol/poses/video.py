@@ -1,0 +1,150 @@
+"""Which frames of a video to take: the sharpest of each part of its time, none where nothing moves.
+
+Two passes through ffmpeg: small grey frames to judge, then the chosen ones at full size.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.errors import InputError
+from nerfvol.measure.sharpness import sharpness
+
+JUDGED_SIZE = 320
+"""Pixels along the longer side of the frames that are judged."""
+STILL = 0.02
+"""Of the mean brightness: a root mean square difference of thumbnails below which nothing has moved."""
+_THUMBNAIL = 8  # times smaller than the frames that are judged
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """All frames of a video: ``sharpness`` (n,) and ``thumbnails`` (n, h, w) uint8."""
+
+    sharpness: NDArray[np.float32]
+    thumbnails: NDArray[np.uint8]
+
+
+def judge_video(path: Path, on_frame: Callable[[int], object] = lambda n: None) -> Judged:
+    """Sharpness and thumbnail of every frame; ``on_frame`` gets the number of frames so far.
+
+    Raises:
+        InputError: the video cannot be decoded, or has no frames.
+    """
+    values, thumbnails = [], []
+    for frame in _grey_frames(path):
+        values.append(sharpness(frame))
+        h, w = (side // _THUMBNAIL for side in frame.shape)
+        blocks = frame[: h * _THUMBNAIL, : w * _THUMBNAIL].reshape(h, _THUMBNAIL, w, _THUMBNAIL)
+        thumbnails.append(blocks.mean((1, 3)).astype(np.uint8))
+        on_frame(len(values))
+    if not values:
+        raise InputError(f"{path}: the video holds no frames that can be decoded")
+    return Judged(np.array(values, np.float32), np.stack(thumbnails))
+
+
+def choose_frames(judged: Judged, most: int) -> list[int]:
+    """At most ``most`` frames: of as many equal parts of the time the sharpest one, none of a part in which nothing moved."""
+    n = len(judged.sharpness)
+    edges = np.linspace(0, n, min(most, n) + 1).round().astype(int)
+    chosen: list[int] = []
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        best = int(first + np.argmax(judged.sharpness[first:last]))
+        if chosen and _moved(judged.thumbnails[chosen[-1]], judged.thumbnails[best]) < STILL:
+            continue
+        chosen.append(best)
+    return chosen
+
+
+def _moved(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    difference = a.astype(np.float32) - b
+    return float(np.sqrt((difference * difference).mean()) / max(1.0, a.mean()))
+
+
+def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list[str]:
+    """Writes the frames as ``frame_NNNNN.jpg`` (NNNNN: its number in the video), at most ``size`` pixels along the longer
+    side, and returns the names. Pictures appear in ``folder`` only once all are there.
+
+    Raises:
+        InputError: the video cannot be decoded, or the frames not be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [f"frame_{number:05d}.jpg" for number in chosen]
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".frames") as temporary:
+        select = "+".join(f"eq(n\\,{number})" for number in chosen)
+        fit = f"scale='min({size},iw)':'min({size},ih)':force_original_aspect_ratio=decrease:flags=lanczos"
+        out = ["-fps_mode", "passthrough", "-q:v", "2", "-f", "image2", str(Path(temporary) / "%05d.jpg")]
+        result = subprocess.run(
+            [*_ffmpeg(path), "-vf", f"select='{select}',{fit}", *out], capture_output=True, stdin=subprocess.DEVNULL
+        )
+        made = sorted(Path(temporary).glob("*.jpg"))
+        if result.returncode or len(made) != len(chosen):
+            raise _failure(path, result.stderr)
+        for file, name in zip(made, names, strict=True):
+            os.replace(file, folder / name)
+    return names
+
+
+def _ffmpeg(path: Path) -> list[str]:
+    import imageio_ffmpeg
+
+    return [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-loglevel", "error", "-i", str(path), "-map", "0:v:0"]
+
+
+def _grey_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """Small grey frames (h, w); yuv4mpeg states their size, which a video's turn would leave to be guessed."""
+    fit = f"scale={JUDGED_SIZE}:{JUDGED_SIZE}:force_original_aspect_ratio=decrease:flags=area,format=gray"
+    out = ["-vf", fit, "-fps_mode", "passthrough", "-strict", "-1", "-f", "yuv4mpegpipe", "-"]
+    with tempfile.TemporaryFile() as complaints:
+        process = subprocess.Popen(
+            [*_ffmpeg(path), *out], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints
+        )
+        stream = process.stdout
+        assert stream is not None
+        frames = 0
+        try:
+            fields = {word[:1]: word[1:] for word in stream.readline().split()[1:]}
+            if b"W" in fields and b"H" in fields:
+                width, height = int(fields[b"W"]), int(fields[b"H"])
+                while stream.readline():  # FRAME
+                    data = stream.read(width * height)
+                    if len(data) < width * height:
+                        break
+                    frames += 1
+                    yield np.frombuffer(data, np.uint8).reshape(height, width)
+            failed = process.wait()
+        finally:
+            process.kill()
+            process.wait()
+            stream.close()
+        if failed and not frames:
+            complaints.seek(0)
+            raise _failure(path, complaints.read())
+
+
+def _failure(path: Path, complaint: bytes) -> InputError:
+    """What ffmpeg said last, without the path that it repeats."""
+    lines = [line for line in complaint.decode(errors="replace").splitlines() if line.strip()]
+    said = lines[-1].replace(str(path), "").strip(" :") if lines else "ffmpeg gives no reason"
+    return InputError(f"{path}: expected a video, but it does not decode ({said:.120})")
+
+
+def video_frames(path: Path) -> int | None:
+    """About how many frames there are, as the header says; None where it does not."""
+    import imageio_ffmpeg
+
+    with contextlib.suppress(Exception):  # an estimate for a bar: what cannot be decoded is said by judge_video
+        reader = imageio_ffmpeg.read_frames(str(path))
+        meta = next(reader)
+        reader.close()
+        return max(1, round(meta["fps"] * meta["duration"]))
+    return None

@@ -1,0 +1,146 @@
+"""Photographs of different exposure and white balance: a colour map for each, solved in closed form while a run goes on.
+
+Photograph i shows G_i of the scene's colours, a 3x4 map. At a few moments of a run the maps are fitted to what the model
+shows of each view, in small pictures; from then on training sees G_i^-1 of the photograph, while kernels know nothing of it.
+Scene and maps have a gauge: all maps times one, the scene by its inverse, is the same pictures. So the maps are divided by
+their mean, exactly: the mean map is the identity, and the scene has the photographs' mean exposure.
+
+Maps are used where exposures differ by more than SPREAD; else photographs stay as they are, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.datasets.images import UInt8
+from nerfvol.measure.colour_fit import IDENTITY, SATURATED, compose, exposure, fit_colour_map, inverse
+
+MOMENTS = (0.04, 0.08, 0.15, 0.3, 0.6)
+"""Of a run's progress, at which maps are fitted."""
+SPREAD = 0.02
+"""Standard deviation of the exposures, as factors, from which on maps are used."""
+BRIGHTER = 1.02
+"""Exposure of a photograph from which on its saturated pixels, which may be anything from there on, are left out."""
+FITTED_WIDTH = 60
+"""Pixels along the longer side that a picture has at least when its map is fitted."""
+LARGEST_FACTOR = 8
+Mode = Literal["auto", "on", "off"]
+
+Seen = Callable[[int], tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]]
+"""Index of a view -> its photograph (p, 3), what the model shows there (p, 3), both in [0, 1], and weights (p,)."""
+
+
+class Appearance:
+    """The colour maps of a run's photographs.
+
+    ``maps``: (n, 3, 4), scene to photograph; their mean is the identity. ``rounds``: fits made so far. ``active``: whether
+    photographs are corrected.
+    """
+
+    def __init__(self, n: int, mode: Mode = "auto") -> None:
+        self.maps = np.repeat(IDENTITY[None], n, axis=0)
+        self.mode: Mode = mode
+        self.rounds, self.active = 0, False
+        self._to_scene = self.maps.copy()
+
+    def due(self, progress: float) -> bool:
+        """Whether a fit is due at ``progress`` in [0, 1]; after the first one that finds nothing, none is."""
+        if self.mode == "off" or self.rounds >= len(MOMENTS) or (self.rounds and not self.active):
+            return False
+        return progress >= MOMENTS[self.rounds]
+
+    @property
+    def may_change(self) -> bool:
+        """Whether photographs will be asked for again because of a fit to come."""
+        return self.mode != "off" and self.rounds < len(MOMENTS) and (self.active or not self.rounds)
+
+    def fit(self, seen: Seen, progress: float) -> bool:
+        """Fits all maps to what the model shows now; whether photographs are corrected from here on."""
+        while self.rounds < len(MOMENTS) and progress >= MOMENTS[self.rounds]:
+            self.rounds += 1  # a run on a clock may jump over moments
+        fitted = []
+        for i in range(len(self.maps)):
+            photograph, shown, weight = seen(i)
+            fitted.append(fit_colour_map(shown, photograph, weight))
+        maps = centred(np.stack(fitted))
+        if not self.active and self.mode == "auto" and spread(maps) <= SPREAD:
+            return False
+        self._use(maps)
+        return True
+
+    def _use(self, maps: NDArray[np.float64]) -> None:
+        self.maps, self.active = maps, True
+        self._to_scene = np.stack([inverse(m) for m in maps])
+
+    def corrected(self, i: int, image: UInt8) -> UInt8:
+        """Photograph i (h, w, 3 or 4) as the scene's colours; itself where nothing is corrected.
+
+        Of four channels the last is the pixel's weight and becomes 0 where a photograph brighter than the others is saturated.
+        """
+        if not self.active:
+            return image
+        return self._mapped(i, image, masks=True)
+
+    def corrected_colours(self, i: int, image: UInt8) -> UInt8:
+        """The same with the fourth channel, an opacity, as it is."""
+        return self._mapped(i, image, masks=False) if self.active else image
+
+    def _mapped(self, i: int, image: UInt8, masks: bool) -> UInt8:
+        m = self._to_scene[i].astype(np.float32)
+        flat = image.reshape(-1, image.shape[2])
+        values = flat[:, :3] @ m[:, :3].T
+        values += 255 * m[:, 3] + 0.5
+        np.clip(values, 0, 255, out=values)
+        out = flat.copy()
+        out[:, :3] = values
+        if masks and image.shape[2] == 4 and exposure(self.maps[i]) > BRIGHTER:
+            out[(flat[:, :3] >= 255 * SATURATED).any(1), 3] = 0
+        return out.reshape(image.shape)
+
+    def exposures(self) -> NDArray[np.float64]:
+        """Exposure of each photograph against their mean, a factor (n,)."""
+        return np.array([exposure(m) for m in self.maps])
+
+    def sentence(self) -> str:
+        """For a person, once maps are used."""
+        low, high = self.exposures().min(), self.exposures().max()
+        return (
+            f"the photographs' exposures differ ({low:.2f} to {high:.2f} of the mean): each gets a colour map; scores are "
+            "given plain and after the same fit (--appearance off: none)"
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a continuation needs."""
+        return {"maps": self.maps, "rounds": self.rounds, "active": int(self.active)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues from :meth:`state_dict`; ValueError where it does not fit."""
+        maps = np.array(state["maps"], np.float64)
+        if maps.shape != self.maps.shape or not np.isfinite(maps).all():
+            raise ValueError(f"colour maps {maps.shape} for {len(self.maps)} photographs")
+        self.rounds = int(state["rounds"])
+        if int(state["active"]):
+            self._use(maps)
+
+
+def centred(maps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The maps (n, 3, 4) after one common map of the scene's colours, so that their mean is the identity."""
+    undo = inverse(maps.mean(0))
+    return np.stack([compose(m, undo) for m in maps])
+
+
+def spread(maps: NDArray[np.float64]) -> float:
+    """Standard deviation of the maps' exposures."""
+    return float(np.std([exposure(m) for m in maps]))
+
+
+def fitting_factor(width: int, height: int) -> int:
+    """The power of two by which a picture is reduced before its map is fitted."""
+    factor = LARGEST_FACTOR
+    while factor > 1 and max(width, height) / factor < FITTED_WIDTH:
+        factor //= 2
+    return factor

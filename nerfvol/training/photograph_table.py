@@ -1,0 +1,129 @@
+"""Which photographs fit the model badly, and what may be wrong with them: a table, and a sentence with advice.
+
+Errors are of small pictures after the photograph's colour map: what stays is a wrong pose, something that moved, or a blur so
+large that it shows at an eighth of the size. Sharpness is compared with the neighbours by name, which show about the same.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import area_average
+from nerfvol.files.atomic import write_text
+from nerfvol.measure.colour_fit import apply_map, exposure
+from nerfvol.measure.sharpness import sharpness
+from nerfvol.training.phase import FinalPhase
+
+JUDGED_SIZE = 320
+"""Pixels along the longer side, at least, of pictures whose sharpness is looked at."""
+BLURRED = 0.5
+"""Of the neighbours' median sharpness."""
+NEIGHBOURS = 4
+"""To each side."""
+ODD_EXPOSURE = 1.4
+"""Exposure, or its inverse, from which on a photograph is called bright or dark."""
+BAD_DB, BAD_DEVIATIONS = 3.0, 3.5
+"""A photograph is bad that lies so many dB below the median and so many robust deviations."""
+NAMED = 5
+
+
+@dataclass(frozen=True)
+class Row:
+    """psnr: of a small picture after its colour map, dB; sharpness: of its neighbours' median; exposure: of the mean."""
+
+    name: str
+    psnr: float
+    sharpness: float
+    exposure: float
+    remark: str
+
+
+def write_table(path: Path, dataset: Dataset, phase: FinalPhase) -> str:
+    """Writes a row for each training photograph as CSV, the worst first, and returns a sentence for a person."""
+    rows = make_rows(dataset, phase)
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(["photograph", "psnr_small_db", "sharpness_of_neighbours", "exposure_of_mean", "remark"])
+    for row in sorted(rows, key=lambda row: row.psnr):
+        out.writerow([row.name, f"{row.psnr:.2f}", f"{row.sharpness:.2f}", f"{row.exposure:.3f}", row.remark])
+    write_text(path, text.getvalue())
+    return advice(rows, path.name)
+
+
+def make_rows(dataset: Dataset, phase: FinalPhase) -> list[Row]:
+    """A row for each photograph of ``dataset``, in its order."""
+    maps = phase.appearance.maps
+    errors = np.array([_psnr(*phase.seen(i), maps[i]) for i in range(len(dataset))])
+    own = dataset.pyramid((1, 1, 1), 1, lambda image: sharpness(_grey(image)))
+    sharp = relative_to_neighbours(np.array(own), dataset.names)
+    bad = outliers(errors)
+    rows = []
+    for i, name in enumerate(dataset.names):
+        gain = exposure(maps[i])
+        remarks = ["fits badly"] if bad[i] else []
+        remarks += ["blurred"] if sharp[i] < BLURRED else []
+        remarks += ["bright"] if gain > ODD_EXPOSURE else ["dark"] if gain < 1 / ODD_EXPOSURE else []
+        rows.append(Row(name, float(errors[i]), float(sharp[i]), gain, ", ".join(remarks)))
+    return rows
+
+
+def advice(rows: Sequence[Row], table: str) -> str:
+    """One sentence: which photographs to look at, and what to do with them."""
+    bad = sorted((row for row in rows if "fits badly" in row.remark), key=lambda row: row.psnr)
+    blurred = [row.name for row in rows if "blurred" in row.remark and row not in bad]
+    usual = float(np.median([row.psnr for row in rows]))
+    if bad:
+        names = ", ".join(f"{row.name} ({row.psnr:.0f} dB)" for row in bad[:NAMED])
+        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+        what = "blurred, take them again" if all("blurred" in row.remark for row in bad) else (
+            "something moved, or their poses are wrong: leave them out"
+        )  # fmt: skip
+        said = f"{len(bad)} of {len(rows)} photographs fit badly, where {usual:.0f} dB is usual"
+        return f"{said}: {names}{more}; {what} ({table})"
+    if blurred:
+        names = ", ".join(blurred[:NAMED])
+        more = f" and {len(blurred) - NAMED} more" if len(blurred) > NAMED else ""
+        said = f"{len(blurred)} of {len(rows)} photographs are blurred: {names}{more}"
+        return f"{said}; the scene is sharper without them ({table})"
+    return f"no photograph fits much worse than the others ({table})"
+
+
+def outliers(psnr: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which of the values (n,) lie far below the others."""
+    middle = np.median(psnr)
+    deviation = 1.4826 * np.median(np.abs(psnr - middle))
+    return psnr < middle - max(BAD_DB, BAD_DEVIATIONS * float(deviation))
+
+
+def relative_to_neighbours(values: NDArray[np.floating], names: Sequence[str]) -> NDArray[np.float64]:
+    """Each value (n,) over the median of its neighbours by name."""
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    out = np.ones(len(values))
+    for place, i in enumerate(order):
+        near = [
+            order[k] for k in range(max(0, place - NEIGHBOURS), min(len(order), place + NEIGHBOURS + 1)) if k != place
+        ]
+        middle = float(np.median(values[near])) if near else 0.0
+        out[i] = values[i] / middle if middle > 0 else 1.0
+    return out
+
+
+def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    small = area_average(image, max(1, max(image.shape[:2]) // JUDGED_SIZE))
+    return small[..., :3].mean(axis=2).astype(np.uint8)
+
+
+def _psnr(photograph: Any, shown: Any, weight: Any, colour_map: Any) -> float:
+    difference = np.clip(apply_map(colour_map, np.clip(shown, 0, 1)), 0, 1) - photograph
+    total = float(np.sum(weight, dtype=np.float64)) * 3
+    error = float((difference.astype(np.float64) ** 2 * np.asarray(weight)[..., None]).sum())
+    return -10 * float(np.log10(max(error / max(total, 1e-9), 1e-10)))

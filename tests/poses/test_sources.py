@@ -1,0 +1,88 @@
+"""Which pictures a folder holds, upright copies of them, and which camera took them."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerfvol.errors import InputError
+from nerfvol.poses.sources import camera_groups, copy_photographs, find_photographs
+
+EXIF, FOCAL, FOCAL_35, ORIENTATION, MODEL = 0x8769, 0x920A, 0xA405, 0x0112, 0x0110
+
+
+def save(path, size=(40, 30), model=None, focal=None, film=None, orientation=None, picture=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if picture is None:
+        picture = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3), np.uint8)
+    exif = Image.Exif()
+    if model is not None:
+        exif[MODEL] = model
+    if orientation is not None:
+        exif[ORIENTATION] = orientation
+    inner = {tag: value for tag, value in ((FOCAL, focal), (FOCAL_35, film)) if value is not None}
+    if inner:
+        exif.get_ifd(EXIF).update(inner)
+    Image.fromarray(picture).save(path, exif=exif, quality=98)
+    return path
+
+
+def test_focal_length_of_35_mm_film(tmp_path):
+    """A 27 mm lens on film sees a diagonal of 43.27 mm; a picture of 40x30 pixels has one of 50."""
+    save(tmp_path / "in/a.jpg", model="P1", focal=4.2, film=27)
+    (photograph,), _ = copy_photographs([tmp_path / "in/a.jpg"], tmp_path / "out", 1000)
+    assert photograph.focal == pytest.approx(27 * 50 / np.hypot(36, 24))
+    assert "P1" in photograph.camera and "4.20" in photograph.camera
+
+
+def test_copies_are_upright_and_of_the_size_that_was_asked_for(tmp_path):
+    """Orientation 6: the picture's top is at the right of what is stored."""
+    picture = np.zeros((60, 100, 3), np.uint8)
+    picture[:, 50:] = 255
+    save(tmp_path / "in/a.jpg", orientation=6, picture=picture)
+    (photograph,), _ = copy_photographs([tmp_path / "in/a.jpg"], tmp_path / "out", 50)
+    image = np.asarray(Image.open(tmp_path / "out" / photograph.name).convert("L")).astype(float)
+    assert (photograph.width, photograph.height) == (30, 50) == image.shape[::-1]
+    assert image[:20].mean() < 20 and image[30:].mean() > 235
+
+
+def test_what_needs_no_change_is_copied_byte_by_byte(tmp_path):
+    path = save(tmp_path / "in/a.jpg")
+    copy_photographs([path], tmp_path / "out", 1000)
+    assert (tmp_path / "out/a.jpg").read_bytes() == path.read_bytes()
+
+
+def test_groups_by_size_camera_and_focal_length(tmp_path):
+    paths = [save(tmp_path / f"in/a{i}.jpg", model="P1", focal=4.2, film=27) for i in range(3)]
+    paths += [save(tmp_path / "in/zoomed.jpg", model="P1", focal=9.0, film=58), save(tmp_path / "in/other.jpg", size=(30, 40))]
+    photographs, _ = copy_photographs(paths, tmp_path / "out", 1000)
+    groups = camera_groups(photographs)
+    assert [len(group.names) for group in groups] == [3, 1, 1]
+    assert [group.known for group in groups] == [True, False, True]
+    assert groups[1].focal == pytest.approx(1.2 * 40) and groups[0].model == "SIMPLE_RADIAL"
+
+
+def test_a_damaged_picture_is_left_out_by_name(tmp_path):
+    good = save(tmp_path / "in/a.jpg")
+    bad = tmp_path / "in/b.jpg"
+    bad.write_bytes(good.read_bytes()[:200])
+    photographs, messages = copy_photographs([good, bad], tmp_path / "out", 1000)
+    assert [p.name for p in photographs] == ["a.jpg"] and len(messages) == 1 and "b.jpg is left out" in messages[0]
+
+
+def test_names_that_differ_by_their_ending_do_not_meet(tmp_path):
+    paths = [save(tmp_path / "in/a.jpg", size=(400, 300)), save(tmp_path / "in/a.png", size=(400, 300))]
+    photographs, _ = copy_photographs(paths, tmp_path / "out", 100)
+    assert len({p.name for p in photographs}) == 2
+
+
+@pytest.mark.parametrize("files,sentence", [
+    ([], "three photographs or more .* holds none"),
+    (["a.heic", "b.HEIC"], "2 HEIC pictures cannot be read; export them as JPEG"),
+    (["walk.mp4"], "give the video itself: walk.mp4"),
+    (["a.jpg"], "holds only 1"),
+])  # fmt: skip
+def test_what_is_no_folder_of_photographs(tmp_path, files, sentence):
+    for name in files:
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match=sentence):
+        find_photographs(tmp_path)

@@ -1,0 +1,76 @@
+"""Frames of a video: the sharpest of each part, none of parts that stand still, at the size that was asked for."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerfvol.errors import InputError
+from nerfvol.files.pictures import open_video
+from nerfvol.measure.sharpness import sharpness
+from nerfvol.poses.video import Judged, choose_frames, judge_video, write_frames
+
+
+def blurred(picture, times):
+    for _ in range(times):
+        picture = sum(np.roll(picture, s, a) for s in (-1, 0, 1) for a in (0, 1)) / 6
+    return picture
+
+
+def test_sharpness_is_the_squared_frequency_of_a_wave():
+    """A wave of k radians a pixel: the discrete Laplacian and central difference multiply it by 2 - 2 cos k and sin k."""
+    x = np.arange(400)
+    for k in (0.3, 0.8, 1.5):
+        wave = np.round(127 + 100 * np.sin(k * x))[None].repeat(50, 0).astype(np.uint8)
+        assert sharpness(wave) == pytest.approx((2 - 2 * np.cos(k)) ** 2 / np.sin(k) ** 2, rel=0.02)
+    assert sharpness(np.full((9, 9), 7, np.uint8)) == 0
+
+
+def test_the_sharpest_of_each_part_and_none_where_nothing_moves():
+    rng = np.random.default_rng(0)
+    thumbnails = rng.integers(0, 255, (12, 5, 5)).astype(np.uint8)
+    thumbnails[6:9] = thumbnails[5]
+    judged = Judged(np.array([1, 3, 2, 1, 1, 9, 5, 6, 5, 4, 8, 7], np.float32), thumbnails)
+    assert choose_frames(judged, 4) == [1, 5, 10]
+    assert choose_frames(judged, 100) == [0, 1, 2, 3, 4, 5, 9, 10, 11]
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """30 frames of a wide picture going by; every third is sharp, the others blurred."""
+    path = tmp_path_factory.mktemp("video") / "walk.mp4"
+    wide = blurred(np.random.default_rng(0).uniform(0, 1, (120, 400)), 2)
+    wide = (wide - wide.min()) / np.ptp(wide)
+    with open_video(path, 30) as writer:
+        for i in range(30):
+            frame = wide[:, 6 * i : 6 * i + 160]
+            frame = frame if i % 3 == 1 else blurred(frame, 12)
+            writer.add(np.repeat(frame[..., None], 3, 2).astype(np.float32))
+    return path
+
+
+def test_a_video_gives_its_sharp_frames(video, tmp_path):
+    judged = judge_video(video)
+    assert judged.sharpness.shape == (30,) and judged.thumbnails.shape[0] == 30
+    chosen = choose_frames(judged, 10)
+    assert chosen == list(range(1, 30, 3))
+    names = write_frames(video, chosen, tmp_path / "images", 80)
+    assert names[0] == "frame_00001.jpg" and len(list((tmp_path / "images").iterdir())) == 10
+    with Image.open(tmp_path / "images" / names[3]) as image:
+        assert image.size == (80, 60)
+
+
+def test_what_does_not_decode_is_said(tmp_path):
+    path = tmp_path / "broken.mp4"
+    path.write_bytes(b"not a video at all" * 100)
+    with pytest.raises(InputError, match="broken.mp4: expected a video, but it does not decode"):
+        judge_video(path)
+
+
+def test_a_video_in_the_middle_of_which_the_file_ends(video, tmp_path):
+    """Cut after the index at its head, it gives the frames there are, or a sentence."""
+    path = tmp_path / "cut.mp4"
+    path.write_bytes(video.read_bytes()[: video.stat().st_size * 2 // 3])
+    try:
+        assert 1 <= len(judge_video(path).sharpness) < 30
+    except InputError as error:
+        assert "cut.mp4" in str(error)

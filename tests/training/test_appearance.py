@@ -1,0 +1,136 @@
+"""Photographs of different exposure: maps recovered, their mean the identity, even sets left alone, scores as for even sets."""
+
+import json
+
+import numpy as np
+import pytest
+
+from nerfvol.cameras.camera import Intrinsics
+from nerfvol.measure.colour_fit import IDENTITY, apply_map, compose, exposure, fit_colour_map, inverse
+from nerfvol.native import native
+from nerfvol.training.appearance import MOMENTS, Appearance, centred
+from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
+from tests.fixtures.runs import metrics_of, settings, start
+
+GAINS = np.random.default_rng(5).uniform(0.7, 1.3, 12)
+
+
+# ---------------------------------------------------------------- the fit
+def test_a_map_is_recovered():
+    """Noise-free, of full rank: only the ridge moves it, by RIDGE over the smallest eigenvalue of the colours' covariance."""
+    rng = np.random.default_rng(0)
+    source = rng.uniform(0, 0.7, (5000, 3))
+    truth = np.array([[1.2, 0.05, 0, 0.01], [0, 0.9, 0.03, -0.01], [0.02, 0, 1.05, 0.0]])
+    found = fit_colour_map(source, apply_map(truth, source))
+    assert np.abs(apply_map(found, source) - apply_map(truth, source)).max() < 0.02
+    assert np.abs(found - truth).max() < 0.08
+
+
+@pytest.mark.parametrize("gain", [0.7, 1.3])
+def test_a_gain_is_recovered_to_a_percent_from_few_colours(gain):
+    """Grey alone says nothing of the other eleven numbers, and 8 bits and saturation take nothing from the gain."""
+    rng = np.random.default_rng(0)
+    source = np.repeat(rng.uniform(0, 1, (4000, 1)), 3, 1)
+    target = np.round(255 * np.clip(gain * source, 0, 1)) / 255
+    found = fit_colour_map(source, target)
+    assert exposure(found) == pytest.approx(gain, rel=0.01)
+
+
+def test_a_blurred_picture_does_not_dim():
+    rng = np.random.default_rng(0)
+    sharp = rng.uniform(0.1, 0.9, (4000, 3))
+    assert exposure(fit_colour_map(sharp.reshape(1000, 4, 3).mean(1).repeat(4, 0), sharp)) == pytest.approx(1, abs=0.01)
+
+
+def test_maps_compose_and_invert():
+    rng = np.random.default_rng(0)
+    a, b = IDENTITY + rng.normal(0, 0.1, (2, 3, 4))
+    colours = rng.uniform(0, 1, (10, 3))
+    assert np.allclose(apply_map(compose(a, b), colours), apply_map(a, apply_map(b, colours)), atol=1e-6)
+    assert np.allclose(compose(inverse(a), a), IDENTITY)
+
+
+def test_the_mean_map_is_the_identity_exactly():
+    maps = centred(IDENTITY + np.random.default_rng(0).normal(0, 0.2, (9, 3, 4)))
+    assert np.abs(maps.mean(0) - IDENTITY).max() < 1e-14
+
+
+# ---------------------------------------------------------------- maps of a run
+def seen_with(gains, scene):
+    def seen(i):
+        taken = np.round(255 * np.clip(gains[i] * scene, 0, 1)) / 255
+        return taken, scene, np.ones(scene.shape[:2])
+
+    return seen
+
+
+def test_even_photographs_stay_as_they_are_bit_for_bit():
+    scene = np.random.default_rng(0).uniform(0, 1, (20, 30, 3))
+    appearance = Appearance(12)
+    assert appearance.due(MOMENTS[0]) and not appearance.fit(seen_with(np.linspace(0.98, 1.02, 12), scene), MOMENTS[0])
+    image = np.random.default_rng(1).integers(0, 255, (6, 7, 4), np.uint8)
+    assert appearance.corrected(3, image) is image and not appearance.due(1.0) and not appearance.may_change
+
+
+def test_uneven_photographs_come_to_one_exposure():
+    scene = np.random.default_rng(0).uniform(0, 0.75, (20, 30, 3))
+    appearance = Appearance(12)
+    assert appearance.fit(seen_with(GAINS, scene), MOMENTS[0]) and appearance.due(MOMENTS[1])
+    assert appearance.exposures() == pytest.approx(GAINS / GAINS.mean(), rel=0.01)
+    for i in (0, 5):
+        taken = np.round(255 * np.clip(GAINS[i] * scene, 0, 1)).astype(np.uint8)
+        wanted = 255 * GAINS.mean() * scene
+        assert np.abs(appearance.corrected(i, taken).astype(float) - wanted).max() < 0.01 * 255 + 1
+
+
+def test_saturated_pixels_of_bright_photographs_weigh_nothing():
+    scene = np.random.default_rng(0).uniform(0, 0.75, (20, 30, 3))
+    appearance = Appearance(12)
+    appearance.fit(seen_with(GAINS, scene), MOMENTS[0])
+    image = np.full((1, 2, 4), 255, np.uint8)
+    image[0, 1] = (200, 90, 90, 255)
+    bright, dark = int(GAINS.argmax()), int(GAINS.argmin())
+    assert appearance.corrected(bright, image)[0, :, 3].tolist() == [0, 255]
+    assert appearance.corrected(dark, image)[0, :, 3].tolist() == [255, 255]
+    assert appearance.corrected_colours(bright, image)[0, :, 3].tolist() == [255, 255]
+
+
+def test_maps_go_through_a_checkpoint():
+    scene = np.random.default_rng(0).uniform(0, 0.75, (20, 30, 3))
+    first, second = Appearance(12), Appearance(12)
+    first.fit(seen_with(GAINS, scene), 0.2)
+    second.load_state_dict(json.loads(json.dumps({k: np.asarray(v).tolist() for k, v in first.state_dict().items()})))
+    image = np.random.default_rng(1).integers(0, 255, (6, 7, 4), np.uint8)
+    assert (second.corrected(2, image) == first.corrected(2, image)).all() and second.rounds == first.rounds == 3
+    with pytest.raises(ValueError, match="colour maps"):
+        Appearance(5).load_state_dict(first.state_dict())
+
+
+# ---------------------------------------------------------------- runs
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """One scene at one exposure and at twelve, none of which saturates: what is lost is lost. What is held out is even."""
+    root = tmp_path_factory.mktemp("exposures")
+    cameras = facing_cameras(14, Intrinsics(80, 56, 78.0, 78.0, 40.0, 28.0))
+    pictures = [np.round(0.75 * draw(c, trace_planes, 2)).astype(np.uint8) for c in cameras]
+    gains = iter(GAINS / GAINS.mean())
+    uneven = [
+        p if i % 8 == 0 else np.clip(np.round(p * next(gains)), 0, 255).astype(np.uint8) for i, p in enumerate(pictures)
+    ]
+    return write_photographs(root / "even", cameras, pictures), write_photographs(root / "uneven", cameras, uneven)
+
+
+@pytest.mark.skipif(native() is None, reason="the reference path takes minutes")
+def test_splats_of_uneven_photographs_score_as_those_of_even_ones(scenes, tmp_path):
+    """±30 % of exposure cost less than 0.3 dB, and more than that without colour maps."""
+    more = {"representation": "splats", "init": "sweep", "checkpoint_every": 1000}
+    more["splats"] = {"steps": 500, "grow_every": 50, "max_splats": 3000}
+
+    def score(scene, name, **also):
+        return metrics_of(start(settings(scene, tmp_path / name, **more, **also)))
+
+    even, uneven = score(scenes[0], "even"), score(scenes[1], "uneven")
+    off = score(scenes[1], "off", appearance="off")
+    assert "psnr_fitted" not in even and "psnr_fitted" not in off
+    assert uneven["psnr_fitted"] > even["psnr"] - 0.3 > off["psnr"]
+    print(even["psnr"], uneven["psnr"], uneven["psnr_fitted"], off["psnr"])
