@@ -1,7 +1,7 @@
-"""Reading and writing OpenVDB files with float trees (Museth 2013; the layout follows OpenVDB's io, version 222+).
+"""Reading OpenVDB files (Museth 2013; the layout follows OpenVDB's io, version 222+); vdb_write.py writes them.
 
-Covers what density volumes need: ``Tree_float_5_4_3`` grids, stored as float or half, uncompressed, zip or blosc, with or
-without active-mask compression, under a scale and translation. Nothing is executed and all
+Covers what density volumes need: grids of float and of vec3s (``Tree_float_5_4_3``), stored as float or half, uncompressed,
+zip or blosc, with or without active-mask compression, under a scale and translation. Nothing is executed and all
 sizes are checked against the file, so a truncated or hostile file is an ``InputError``.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import struct
-import uuid
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +19,9 @@ from numpy.typing import ArrayLike
 
 from data_synth.blosc import decompress
 from data_synth.errors import InputError
-from data_synth.image import replacing
+from data_synth.vdb_write import MAGIC, ZIP
 
-MAGIC = 0x56444220
-ZIP, BLOSC = 1, 4  # bits of the compression flag
+BLOSC = 4  # a bit of the compression flag
 LIMIT = 1 << 30  # voxels of a dense result; more is refused
 # per-node code of how inactive values are stored
 ONE_INACTIVE, MASK_NONE, MASK_ONE, MASK_TWO, ALL_VALUES = 2, 3, 4, 5, 6
@@ -31,14 +29,16 @@ ONE_INACTIVE, MASK_NONE, MASK_ONE, MASK_TWO, ALL_VALUES = 2, 3, 4, 5, 6
 
 @dataclass
 class VdbGrid:
-    """values: (nx, ny, nz) float32 of the active bounding box; first: index of values[0, 0, 0]; voxel_size, origin:
-    world position = origin + voxel_size * index; others: names of the file's other float grids."""
+    """values: (nx, ny, nz), vectors (nx, ny, nz, 3), float32 of the active bounding box; first: index of values[0, 0, 0];
+    voxel_size, origin: world position = origin + voxel_size * index; metadata: bytes by name; others: names of the
+    file's other float grids."""
 
     name: str
     values: np.ndarray
     first: np.ndarray
     voxel_size: np.ndarray
     origin: np.ndarray
+    metadata: dict[str, bytes]
     others: tuple[str, ...] = ()
 
 
@@ -77,7 +77,8 @@ class _Reader:
 
 
 def read_vdb(path: str | os.PathLike, name: str | None = None) -> VdbGrid:
-    """The float grid called ``name`` as a dense array; by default the one called density, else the first."""
+    """The grid called ``name``, of numbers or vectors, as a dense array; by default the float grid called density, else the
+    first of numbers."""
     try:
         r = _Reader(Path(path).read_bytes(), path)
     except OSError as error:
@@ -96,8 +97,9 @@ def read_vdb(path: str | os.PathLike, name: str | None = None) -> VdbGrid:
     for _ in range(r.number("I")):
         grid_name, kind, instance = r.string().split("\x1e")[0], r.string(), r.string()
         position, _, end = (r.number("q") for _ in range(3))
-        if kind.startswith("Tree_float_5_4_3") and not instance:
-            grids.setdefault(grid_name, (position, kind.endswith("_HalfFloat")))
+        vectors = kind.startswith("Tree_vec3s_5_4_3") and name == grid_name
+        if (vectors or kind.startswith("Tree_float_5_4_3")) and not instance:
+            grids.setdefault(grid_name, (position, kind.endswith("_HalfFloat"), 3 if vectors else 1))
         else:
             others.append(grid_name)
         r.at = end
@@ -106,19 +108,19 @@ def read_vdb(path: str | os.PathLike, name: str | None = None) -> VdbGrid:
         held = f"the float grids {', '.join(grids)}" if grids else "no float grid"
         held += f" and {', '.join(others)} of other kinds" if others else ""
         raise r.fail(f"it holds {held}" + (f", not {name}" if name is not None else ""))
-    r.at, half = grids[chosen]
-    return replace(_read_grid(r, chosen, half), others=tuple(other for other in grids if other != chosen))
+    r.at, half, channels = grids[chosen]
+    return replace(_read_grid(r, chosen, half, channels), others=tuple(other for other in grids if other != chosen))
 
 
-def _read_grid(r: _Reader, name: str, half: bool) -> VdbGrid:
+def _read_grid(r: _Reader, name: str, half: bool, channels: int = 1) -> VdbGrid:
     flags = r.number("I")
-    r.metadata()
+    metadata = r.metadata()
     voxel_size, origin = _read_transform(r)
     if r.number("I") != 1:
         raise r.fail("its tree has several buffers")
-    tree = _Tree(r, flags, half)
+    tree = _Tree(r, flags, half, channels)
     first, values = tree.dense()
-    return VdbGrid(name, values, first, voxel_size, origin)
+    return VdbGrid(name, values, first, voxel_size, origin, metadata)
 
 
 def _read_transform(r: _Reader) -> tuple[np.ndarray, np.ndarray]:
@@ -141,14 +143,17 @@ def _read_transform(r: _Reader) -> tuple[np.ndarray, np.ndarray]:
 class _Tree:
     """Root, two levels of internal nodes (32^3 and 16^3 children) and leaves of 8^3 voxels."""
 
-    def __init__(self, r: _Reader, flags: int, half: bool) -> None:
-        self.r, self.flags, self.half = r, flags, half
-        self.background = r.number("f")
-        self.boxes: list[tuple[np.ndarray, int, float]] = []  # active tiles: origin, edge, value
+    channels = 1
+    """Numbers a voxel has: 3 for vectors."""
+
+    def __init__(self, r: _Reader, flags: int, half: bool, channels: int = 1) -> None:
+        self.r, self.flags, self.half, self.channels = r, flags, half, channels
+        self.background = self._value()
+        self.boxes: list[tuple[np.ndarray, int, Any]] = []  # active tiles: origin, edge, value
         self.leaves: list[np.ndarray] = []
         tiles, children = r.number("I"), r.number("I")
         for _ in range(tiles):
-            origin, value, active = r.numbers("<i4", 3), r.number("f"), r.number("?")
+            origin, value, active = r.numbers("<i4", 3), self._value(), r.number("?")
             if active:
                 self.boxes.append((origin, 4096, value))
         for _ in range(children):
@@ -161,7 +166,7 @@ class _Tree:
         values, _ = self._values(n**3, active)
         place = np.stack(np.unravel_index(np.arange(n**3), (n, n, n)), axis=1) * edge + origin
         for k in np.flatnonzero(active & ~child):
-            self.boxes.append((place[k], edge, float(values[k])))
+            self.boxes.append((place[k], edge, values[k]))
         for k in np.flatnonzero(child):
             if log2 == 5:
                 self._internal(place[k], 4)
@@ -176,18 +181,28 @@ class _Tree:
         low = self.background
         high = self.background if code == 0 else -self.background
         if code in (ONE_INACTIVE, MASK_ONE, MASK_TWO):
-            low = r.number("f")
-            high = r.number("f") if code == MASK_TWO else high if code == ONE_INACTIVE else self.background
+            low = self._value()
+            high = self._value() if code == MASK_TWO else high if code == ONE_INACTIVE else self.background
         chosen = r.mask(n) if code in (MASK_NONE, MASK_ONE, MASK_TWO) else np.zeros(n, bool)
         if code == 1:
             low = -self.background
         if code == ALL_VALUES:
             return self._numbers(n), active
+        chosen = chosen if self.channels == 1 else chosen[:, None]
         values = np.where(chosen, high, low).astype(np.float32)
         values[active] = self._numbers(int(active.sum()))
         return values, active
 
+    def _value(self) -> Any:
+        """One value in single precision: a number, or a vector (3,)."""
+        return self.r.number("f") if self.channels == 1 else self.r.numbers("<f4", 3)
+
     def _numbers(self, n: int) -> np.ndarray:
+        """n values: (n,), or (n, 3)."""
+        flat = self._flat(n * self.channels)
+        return flat if self.channels == 1 else flat.reshape(n, self.channels)
+
+    def _flat(self, n: int) -> np.ndarray:
         kind = "<f2" if self.half else "<f4"
         if not self.flags & (ZIP | BLOSC):
             return self.r.numbers(kind, n).astype(np.float32)
@@ -219,66 +234,18 @@ class _Tree:
         first, last = np.min(low, axis=0), np.max(high, axis=0)
         if np.prod((last - first).astype(float)) > LIMIT:
             raise self.r.fail(f"its extent {tuple(int(v) for v in last - first)} is too large to hold")
-        out = np.full(tuple(last - first), self.background, np.float32)
+        shape = tuple(last - first) + ((self.channels,) if self.channels > 1 else ())
+        out = np.full(shape, self.background, np.float32)
 
         def put(origin: np.ndarray, edge: int, value: ArrayLike) -> None:
             a, b = np.maximum(origin - first, 0), np.minimum(origin + edge - first, last - first)
             c, d = a - (origin - first), b - (origin - first)
-            part = value if np.ndim(value) == 0 else np.asarray(value)[c[0] : d[0], c[1] : d[1], c[2] : d[2]]
+            part = value if np.ndim(value) < 3 else np.asarray(value)[c[0] : d[0], c[1] : d[1], c[2] : d[2]]
             if (a < b).all():
                 out[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = part
 
         for origin, edge, value in self.boxes:
             put(origin, edge, value)
         for origin, (values, _) in zip(self.leaves, self.blocks, strict=True):
-            put(origin, 8, values.reshape(8, 8, 8))
+            put(origin, 8, values.reshape(8, 8, 8, *values.shape[1:]))
         return first, out
-
-
-def write_vdb(
-    path: str | os.PathLike,
-    values: np.ndarray,
-    voxel_size: ArrayLike = (1.0, 1.0, 1.0),
-    origin: ArrayLike = (0.0, 0.0, 0.0),
-) -> None:
-    """Write non-negative (nx, ny, nz) values as the float grid "density"; voxels above 0 are active."""
-    values = np.asarray(values, np.float32)
-    if values.ndim != 3 or max(values.shape) > 4096 or not np.isfinite(values).all():
-        raise InputError("write_vdb: expected a finite 3D array of at most 4096 voxels a side")
-    text = lambda s: struct.pack("<I", len(s)) + s.encode()  # noqa: E731
-    entry = lambda name, kind, data: text(name) + text(kind) + struct.pack("<I", len(data)) + data  # noqa: E731
-    header = struct.pack("<qIII?", MAGIC, 224, 10, 0, True) + str(uuid.UUID(int=0)).encode() + struct.pack("<I", 0)
-    header += struct.pack("<I", 1) + text("density") + text("Tree_float_5_4_3") + text("")
-    s = np.asarray(voxel_size, float)
-    scale = np.concatenate([np.asarray(origin, float), s, s, 1 / s, 1 / s**2, 0.5 / s])
-    grid = struct.pack("<I", 0) + struct.pack("<I", 2) + entry("class", "string", b"fog volume")
-    grid += entry("is_saved_as_half_float", "bool", b"\0") + text("ScaleTranslateMap") + scale.astype("<f8").tobytes()
-    topology, buffers = _encode_tree(values)
-    start = len(header) + 24
-    block = start + len(grid) + len(topology)
-    with replacing(path) as temporary:
-        positions = struct.pack("<qqq", start, block, block + len(buffers))
-        temporary.write_bytes(header + positions + grid + topology + buffers)
-
-
-def _encode_tree(values: np.ndarray) -> tuple[bytes, bytes]:
-    padded = np.pad(values, [(0, -n % 128) for n in values.shape])
-    pack = lambda mask: np.packbits(mask, bitorder="little").tobytes()  # noqa: E731
-    leaves, lower = [], []
-    counts = [n // 128 for n in padded.shape]
-    child5 = np.zeros((32, 32, 32), bool)
-    for i, j, k in np.argwhere(np.ones(counts, bool)):
-        node = padded[128 * i : 128 * i + 128, 128 * j : 128 * j + 128, 128 * k : 128 * k + 128]
-        blocks = node.reshape(16, 8, 16, 8, 16, 8).transpose(0, 2, 4, 1, 3, 5).reshape(16, 16, 16, 512)
-        child4 = (blocks > 0).any(axis=-1)
-        if child4.any():
-            child5[i, j, k] = True
-            active = blocks[child4] > 0
-            lower.append(
-                pack(child4.ravel()) + bytes(512) + b"\6" + bytes(4 * 4096) + b"".join(pack(a) for a in active)
-            )
-            leaves += [pack(a) + b"\6" + b.astype("<f4").tobytes() for a, b in zip(active, blocks[child4], strict=True)]
-    root = struct.pack("<IfII", 1, 0.0, 0, 1 if lower else 0)
-    if lower:
-        root += struct.pack("<3i", 0, 0, 0) + pack(child5.ravel()) + bytes(4096) + b"\6" + bytes(4 * 32768)
-    return root + b"".join(lower), b"".join(leaves)

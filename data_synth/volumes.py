@@ -12,7 +12,8 @@ import numpy as np
 from data_synth import media
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import replacing
-from data_synth.vdb import read_vdb, write_vdb
+from data_synth.vdb import read_vdb
+from data_synth.vdb_write import write_vdb
 
 
 def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:

@@ -62,12 +62,16 @@ FORMATS = {
     "nerfvol splats": "nerfvol.views:SplatModel.load",
 }
 """The ``format`` key of a file's document, and what opens it."""
-SUFFIXES = {".ply": "nerfvol.clouds:load_ply_model", ".spz": "nerfvol.views:SplatModel.load"}
+SUFFIXES = {
+    ".ply": "nerfvol.clouds:load_ply_model", ".spz": "nerfvol.views:SplatModel.load",
+    ".npz": "nerfvol.views:OctreeModel.load_plenoctree",
+}  # fmt: skip
 """Files of other programs, by the end of their names, and what opens them."""
 
 
 def load_model(target: str | os.PathLike[str]) -> Model:
-    """The model in a run folder or a file: our own octrees and splats, Gaussians or points in a .ply, Gaussians in a .spz.
+    """The model in a run folder or a file: our own octrees and splats, Gaussians or points in a .ply, Gaussians in a .spz, a
+    PlenOctree in an .npz.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.

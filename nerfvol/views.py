@@ -144,6 +144,13 @@ class OctreeModel:
         """The model in an octree file; InputError where it is none."""
         return cls(*load_octree(path))
 
+    @classmethod
+    def load_plenoctree(cls, path: str | os.PathLike[str]) -> OctreeModel:
+        """The model in a PlenOctree's .npz; InputError where it is none."""
+        from nerfvol.octree.plenoctree import load_plenoctree
+
+        return cls(load_plenoctree(path))
+
     def save(self, path: str | os.PathLike[str], storage: str = "compact") -> int:
         """See models.Model; storage: "float32", "float16" or "compact" (octree.io.save_octree)."""
         return save_octree(path, self.octree, self.metadata, storage_of(storage))

@@ -3,13 +3,34 @@
 from __future__ import annotations
 
 import argparse
+import re
+import time
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
-from nerfvol.cli.target import open_target
-from nerfvol.config.values import Count, fraction
+from nerfvol.cli.target import Target, open_target
+from nerfvol.config.assemble import run_settings
+from nerfvol.config.values import Count, box, fraction
 from nerfvol.export import EXPORTS, choose, export_model
+
+if TYPE_CHECKING:
+    from nerfvol.export.surface import Cameras
+
+_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
+
+
+def byte_count(value: Any) -> Any:
+    """A number of bytes from 2000000, "500kB", "2MB" or "1.5G"; None stays. ValueError for others."""
+    match = re.fullmatch(r"([0-9.]+)\s*([kmg]?)b?", str(value).strip().lower())
+    try:
+        count = None if value is None else int(float(match[1]) * _UNITS[match[2]]) if match else 0
+    except ValueError:
+        count = 0
+    if count is not None and count < 1:
+        raise ValueError(f"expected a size such as 500kB, 2MB or 1GB, got {value!r}")
+    return count
 
 
 @dataclass
@@ -19,9 +40,18 @@ class ExportOptions:
     target: str = ""
     out: str = ""
     format: str | None = None
+    level: Count | None = None
+    max_bytes: Annotated[int | None, byte_count] = None
+    crop: Annotated[tuple[float, ...] | None, box] = None
+    up: Literal["none", "+x", "-x", "+y", "-y", "+z", "-z"] | None = None
     threshold: Annotated[float, fraction] | None = None
+    method: Literal["surface", "centers"] | None = None
+    views: Count | None = None
+    cameras: str | None = None
     resolution: Count | None = None
-    quantity: Literal["sigma", "opacity"] | None = None
+    quantity: Literal["sigma", "opacity", "color"] | None = None
+    full_float: bool = False
+    srgb: bool = False
     threads: int = 0
 
 
@@ -29,15 +59,32 @@ def arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--out", metavar="FILE", help="; ".join(
-        f"{' or '.join(row.suffixes)}: {row.name} of {' or '.join(row.kinds)}, opened by {row.opened_by}"
+        f"{' or '.join(s or 'a folder' for s in row.suffixes)}: {row.name} of {' or '.join(row.kinds)}, opened by {row.opened_by}"
         for row in EXPORTS).replace("%", "%%"))  # fmt: skip
     p.add_argument("--format", metavar="|".join(row.name for row in EXPORTS), help="where an extension serves several "
                    "(default: the first that holds the model)")  # fmt: skip
-    p.add_argument("--threshold", metavar="O", help="points: least opacity, of a leaf along its side or of a splat "
-                   "(default: 0.5)")  # fmt: skip
-    p.add_argument("--resolution", metavar="N", help="grid: samples along the longest side (default: 256)")
-    p.add_argument("--quantity", metavar="sigma|opacity", help="grid: density in 1/scene unit, or the opacity of a voxel "
-                   "along its side (default: sigma)")  # fmt: skip
+    p.add_argument("--level", metavar="L", help=f"{_takers('')}: finest level of an octree that is written, 1 or more "
+                   "(default: all; vdb: 8)")  # fmt: skip
+    p.add_argument("--max-bytes", metavar="SIZE", help="the same: the finest level whose file is no larger, such as 2MB")
+    p.add_argument("--crop", metavar="X0,Y0,Z0,X1,Y1,Z1", help="only what lies in this box, scene units")
+    p.add_argument("--up", metavar="none|+y|-y|+z|…", help=f"{_takers('up')}: axis that the scene's up becomes (default: "
+                   "+y for .glb and .obj, none for the others; most splat viewers want -y)")  # fmt: skip
+    p.add_argument("--method", metavar="surface|centers", help="points: median depths of views, one a voxel, with normals, "
+                   "or centres of leaves and means of splats (default: surface)")  # fmt: skip
+    p.add_argument("--threshold", metavar="O", help="points: least opacity, of a pixel, a leaf along its side or a splat "
+                   "(default: 0.9 of surfaces, 0.5 of centers)")  # fmt: skip
+    p.add_argument("--views", metavar="N", help="points, mesh: views that see the surface (default: 40, 60)")
+    p.add_argument("--cameras", metavar="FILE|DATA|sphere", help="points, mesh, transforms, colmap: a camera path, a data set, or "
+                   "a sphere around the model (default: the run's training cameras where its data are there)")  # fmt: skip
+    p.add_argument("--resolution", metavar="N", help="grid, mesh, points: voxels along the longest side (default: 256, 256, 512)")
+    p.add_argument("--quantity", metavar="sigma|opacity|color", help="grid: density in 1/scene unit, the opacity of a voxel "
+                   "along its side, or colour (default: sigma)")  # fmt: skip
+    p.add_argument("--full-float", action="store_true", help="vdb: 32-bit numbers instead of 16-bit")
+    p.add_argument("--srgb", action="store_true", help="vdb: colours as trained instead of linear")
+
+
+def _takers(option: str) -> str:
+    return ", ".join(row.name for row in EXPORTS if (option in row.options if option else row.levels))
 
 
 def run(options: ExportOptions) -> int:
@@ -48,18 +95,53 @@ def run(options: ExportOptions) -> int:
     """
     need("export", target=options.target, out=options.out)
     target = open_target(options.target)
-    choose(options.out, target.model.kind, options.format)
+    row = choose(options.out, target.model.kind, options.format)
     prepare_outputs(file=options.out)
     set_threads(options.threads)
-    given = {name: getattr(options, name) for name in ("threshold", "resolution", "quantity")}
-    row, size = export_model(target.model, options.out, options.format, **given)
-    print(f"{options.out}: {row.name}, {size / 1e6:.1f} MB; opened by {row.opened_by}")
+    given: dict[str, Any] = {
+        name: getattr(options, name) for name in ("threshold", "resolution", "quantity", "method", "views", "up")
+    }
+    given |= {"full_float": options.full_float or None, "srgb": options.srgb or None}
+    if options.cameras not in (None, "sphere") or "cameras" in row.options and options.cameras is None:
+        given["cameras"] = _cameras(target, options.cameras)
+    if given.get("cameras") is not None and "views" in row.options:
+        print(f"the surface is seen from the cameras of {given['cameras'].source}")
+    level = options.level
+    if row.name == "vdb" and level is None and options.max_bytes is None:
+        level = 8  # finer ones are large, and programs that march them slow
+    started = time.perf_counter()
+    written = export_model(
+        target.model, options.out, options.format, level=level, max_bytes=options.max_bytes, crop=options.crop, **given
+    )
+    seconds = time.perf_counter() - started
+    at = f" at level {written.level}" if row.levels and written.level is not None else ""
+    print(f"{options.out}: {row.name}{at}, {written.size / 1e6:.1f} MB in {seconds:.1f} s; opened by {row.opened_by}")
     return 0
+
+
+def _cameras(target: Target, name: str | None) -> Cameras | None:
+    """Those of a camera path or a data set; where no name is given, of the run's data, if they are there."""
+    from nerfvol.cameras.paths import load_cameras
+    from nerfvol.export.surface import Cameras
+
+    data = name or run_settings(target.name).get("data")
+    if not data or name is None and not Path(data).exists():
+        return None
+    if Path(data).is_file():
+        cameras = load_cameras(data)
+        return Cameras(cameras, [f"{i:04d}.png" for i in range(len(cameras))], str(data))
+    from nerfvol.datasets.formats import find_format
+    from nerfvol.datasets.load import load_dataset
+
+    dataset = load_dataset(data, "train")
+    frames = find_format(Path(data)).reader.read(Path(data), "train").frames
+    return Cameras(dataset.cameras, [frame.path.name for frame in frames if frame.path is not None], str(data))
 
 
 COMMAND = Command(
     summary="Write a model as a file that other programs open.",
-    example="nerfvol export run --out scene.ply",
+    example="nerfvol export run --out scene.glb\nnerfvol export run --out scene.vdb --level 8\n"
+    "nerfvol export run --out points.ply --crop -1,-1,0,1,1,1",
     options=ExportOptions,
     arguments=arguments,
     run=run,

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 
+from nerfvol.export import splats
+from nerfvol.export.part import Up
 from nerfvol.models import Model
 from nerfvol.splats.spz import save_spz
 
 
-def memory(model: Model) -> int:
+def memory(model: Model, up: Up = "none") -> int:
     """Bytes that writing takes: the arrays, the library's copy, its packed bytes."""
-    splats = model.splats  # type: ignore[attr-defined]
-    return 4 * sum(array.nbytes for array in (splats.means, splats.log_scales, splats.quats, splats.logits, splats.sh))
+    return 2 * splats.memory(model, up)
 
 
-def write(model: Model, path: str | os.PathLike[str]) -> int:
-    """The Gaussians of a model of splats, or those that draw a point cloud, in version 3, which is read everywhere."""
-    return save_spz(path, model.splats)  # type: ignore[attr-defined]
+def write(model: Model, path: str | os.PathLike[str], up: Up = "none") -> int:
+    """The Gaussians of splats.splats_of, in version 3, which is read everywhere."""
+    return save_spz(path, splats.splats_of(model, up))

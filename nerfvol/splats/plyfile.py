@@ -185,15 +185,19 @@ class PlyFile:
         return out
 
 
-def write_ply(path: str | os.PathLike[str], comments: Sequence[str], columns: Mapping[str, NDArray]) -> int:
+def write_ply(
+    path: str | os.PathLike[str], comments: Sequence[str], columns: Mapping[str, NDArray], faces: NDArray | None = None
+) -> int:
     """Write ``columns`` (n,), bytes as they are and all others as float32, as the vertices of a binary little-endian PLY,
-    atomically; returns its bytes."""
+    and triangles ``faces`` (m, 3), numbers of vertices, atomically; returns its bytes."""
     n = len(next(iter(columns.values())))
     row = np.dtype([(name, "u1" if c.dtype == np.uint8 else "<f4") for name, c in columns.items()])
     kinds = {name: "uchar" if c.dtype == np.uint8 else "float" for name, c in columns.items()}
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    lines += [f"element vertex {n}", *(f"property {kind} {name}" for name, kind in kinds.items()), "end_header", ""]
-    header = "\n".join(lines).encode("ascii")
+    lines += [f"element vertex {n}", *(f"property {kind} {name}" for name, kind in kinds.items())]
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header = "\n".join([*lines, "end_header", ""]).encode("ascii")
     run = max(1, _RUN // row.itemsize)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(header)
@@ -202,4 +206,9 @@ def write_ply(path: str | os.PathLike[str], comments: Sequence[str], columns: Ma
             for name, column in columns.items():
                 rows[name] = column[at : at + run]
             file.write(rows.tobytes())
-    return len(header) + n * row.itemsize
+        for at in range(0, 0 if faces is None else len(faces), run):
+            assert faces is not None
+            triangles = np.empty(min(run, len(faces) - at), [("n", "u1"), ("v", "<i4", 3)])
+            triangles["n"], triangles["v"] = 3, faces[at : at + run]
+            file.write(triangles.tobytes())
+        return file.tell()

@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.octree.points import Y00
 from nerfvol.splats.neighbours import nearest
 from nerfvol.splats.plyfile import PlyFile
 from nerfvol.splats.splats import Splats
 
-Y00 = math.sqrt(1 / (4 * math.pi))
-"""The constant spherical harmonic: a Gaussian's colour is 1/2 + Y00 x its first coefficient."""
 NEIGHBOURS = 8
 OPAQUE = 1 - 1 / 255
 _FLAT = 1e-3  # of a disc's radius: its thickness, since a Gaussian of none has no logarithm

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.rotations import rotations
 
 MODES = ("mip", "plain")
 MAX_DEGREE = 3
@@ -129,15 +130,3 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     moved = [replace(p.with_sh_degree(degree), means=p.means + (p.origin - origin), origin=origin) for p in parts]
     names = ("means", "log_scales", "quats", "logits", "sh")
     return replace(parts[0], **{name: np.concatenate([getattr(p, name) for p in moved]) for name in names})
-
-
-def rotations(quats: ArrayLike) -> NDArray[np.float64]:
-    """Matrices (n, 3, 3) float64 of quaternions (n, 4) of any length, columns being the splats' axes."""
-    q = np.asarray(quats, np.float64)
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)

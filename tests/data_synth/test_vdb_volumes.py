@@ -9,7 +9,8 @@ import pytest
 from data_synth import media, scenes
 from data_synth.blosc import decompress
 from data_synth.errors import InputError, RenderWarning
-from data_synth.vdb import _Reader, _Tree, read_vdb, write_vdb
+from data_synth.vdb import _Reader, _Tree, read_vdb
+from data_synth.vdb_write import SparseGrid, write_grids, write_vdb
 from data_synth.volumes import read_volume, write_density
 from tests.fixtures.real import real_data
 
@@ -29,6 +30,47 @@ def test_round_trip(tmp_path, values):
     assert np.allclose(grid.origin, (1.0, 2.0, 3.0))
     part = values[tuple(slice(f, f + n) for f, n in zip(grid.first, grid.values.shape, strict=True))]
     assert np.array_equal(part, grid.values) and grid.values.sum() == values.sum()
+
+
+def test_a_grid_says_its_name_and_where_it_is(tmp_path, values):
+    """Blender shows a grid without these as nameless and of size 0, and finds no "density"."""
+    write_vdb(tmp_path / "a.vdb", values)
+    said = read_vdb(tmp_path / "a.vdb").metadata
+    where = np.argwhere(values > 0)
+    assert said["name"] == b"density" and said["class"] == b"fog volume"
+    assert struct.unpack("<3i", said["file_bbox_min"]) == tuple(where.min(0))
+    assert struct.unpack("<3i", said["file_bbox_max"]) == tuple(where.max(0))
+    assert struct.unpack("<q", said["file_voxel_count"]) == (len(where),)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_sparse_grids_far_apart_and_below_zero(tmp_path, half):
+    """Indices of either sign, in several root nodes and in any order; numbers and vectors in one file."""
+    rng = np.random.default_rng(3)
+    coords = np.unique(rng.integers(-60, 60, (4000, 3)) + rng.choice([-130, 0, 140], (4000, 3)), axis=0)
+    rng.shuffle(coords)
+    numbers, vectors = (rng.uniform(-2, 2, (len(coords), *more)).astype(np.float32) for more in ((), (3,)))
+    grids = [SparseGrid("density", coords, numbers, 0.5, (1, 2, 3)), SparseGrid("color", coords, vectors, kind="unknown")]
+    assert write_grids(tmp_path / "a.vdb", grids, half) == (tmp_path / "a.vdb").stat().st_size
+    for name, wanted in (("density", numbers), ("color", vectors)):
+        grid = read_vdb(tmp_path / "a.vdb", name)
+        got = grid.values[tuple((coords - grid.first).T)]
+        assert np.abs(got - wanted).max() <= (2**-11 * 2 if half else 0)  # half a unit in the last place of 16 bits
+        absent = np.ones(grid.values.shape[:3], bool)
+        absent[tuple((coords - grid.first).T)] = False
+        assert not grid.values[absent].any()
+    assert read_vdb(tmp_path / "a.vdb").values.ndim == 3
+
+
+def test_grids_that_no_file_holds(tmp_path):
+    place = np.zeros((2, 3), int)
+    for coords, values, message in (
+        (place, np.ones(2), "a voxel twice"), (place[:0], np.ones(0), "active voxels"), (place[:1], [np.inf], "not finite"),
+        (place[:1], [1e5], "16-bit"), (place[:1] + (1 << 31), [1.0], "beyond"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            write_grids(tmp_path / "a.vdb", [SparseGrid("density", coords, np.asarray(values))])
+    assert not list(tmp_path.iterdir())
 
 
 def test_every_truncation_is_an_input_error(tmp_path, values):
@@ -155,7 +197,7 @@ def test_blosc_frames(n, width, block, shuffle, split):
 def test_blosc_and_other_formats_are_named(tmp_path, values):
     write_vdb(tmp_path / "a.vdb", values[:9, :9, :9])
     data = (tmp_path / "a.vdb").read_bytes()
-    at = data.index(struct.pack("<I", 2) + struct.pack("<I", 5) + b"class") - 4
+    at = data.index(struct.pack("<I", 7) + struct.pack("<I", 4) + b"name") - 4
     (tmp_path / "b.vdb").write_bytes(data[:at] + struct.pack("<I", 4) + data[at + 4 :])
     with pytest.raises(InputError, match="b.vdb"):
         read_vdb(tmp_path / "b.vdb")

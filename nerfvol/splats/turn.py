@@ -1,0 +1,42 @@
+"""Splats in turned axes: means, the Gaussians' own axes, and the bands of their colours' spherical harmonics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from nerfvol.rotations import product, quaternion
+from nerfvol.sh import basis_dim, eval_basis
+from nerfvol.splats.splats import Splats
+
+Float = NDArray[np.float64]
+
+
+def turned(splats: Splats, rotation: Float) -> Splats:
+    """The splats with every point x moved to ``rotation`` (3, 3) x: seen from turned cameras they look the same."""
+    if np.array_equal(rotation, np.eye(3)):
+        return splats
+    return replace(
+        splats,
+        means=splats.means.astype(np.float64) @ rotation.T,
+        quats=product(quaternion(rotation), splats.quats),
+        sh=splats.sh.astype(np.float64) @ sh_rotation(splats.sh_degree, rotation).T,
+        origin=rotation @ splats.origin,
+    )
+
+
+def sh_rotation(degree: int, rotation: Float) -> Float:
+    """(K, K), K = (degree + 1)**2: the coefficients of a function in turned axes from those before.
+
+    Each band turns into itself: f'(R d) = f(d) for the function's values along directions that are many and spread enough to tell
+    its coefficients (a Fibonacci lattice), by least squares, exact to rounding.
+    """
+    n = 16 * basis_dim(degree)
+    z = 1 - (2 * np.arange(n) + 1) / n
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    d = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+    before, after = (eval_basis(degree, torch.from_numpy(np.ascontiguousarray(v))).numpy() for v in (d, d @ rotation.T))
+    return np.linalg.lstsq(after, before, rcond=None)[0]
