@@ -23,10 +23,10 @@ UNITS = ("web.cpp", "prefilter.cpp", "topology.cpp", "web_pool.cpp")
 OUT = ROOT / "nerfvol" / "viewer" / "kernels.wasm"
 STAMP = OUT.with_suffix(".json")
 FLAGS = (
-    "-std=c++17", "-O3", "-msimd128", "-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics", "-mexec-model=reactor",
+    "-std=c++17", "-O3", "-msimd128", "-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics",
     "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DNERFVOL_ISA=baseline", "-Wall", "-Wextra", "-Wno-psabi",
 )  # fmt: skip
-LINK = ("-Wl,-z,stack-size=1048576", "-Wl,--gc-sections", "-Wl,--strip-all")
+LINK = ("-mexec-model=reactor", "-Wl,-z,stack-size=1048576", "-Wl,--gc-sections", "-Wl,--strip-all")
 """Packets of rays overflow the linker's own stack of 64 kB."""
 
 
