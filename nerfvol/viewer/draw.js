@@ -32,15 +32,30 @@ class Drawing {
     URL.revokeObjectURL(url);
   }
 
-  // The model in `bytes`, now: the pictures go on once every worker has opened it.
+  // The model in `bytes`, now. Of an octree the first worker numbers the corners while the second decodes the values; the first then
+  // makes the nodes of coarser levels while the others draw already.
   async load(module, bytes) {
-    this.module = module;
+    const n = this.workers.length, shared = n > 1 && !this.isSplats;
+    const parts = this.workers.map((_, i) => (!shared ? ["corners", "values", "nodes"] : [["corners"], ["values"]][i] || []));
     this.frame = null;
+    this.active = shared ? this.workers.slice(1) : [...this.workers];
+    const relay = (from, data) => this.workers.forEach((worker, i) => i !== from && worker.postMessage({ ...data, type: "take" }));
     await Promise.all(this.workers.map((worker, index) => new Promise((resolve) => {
-      worker.onmessage = ({ data }) => (data.type === "opened" ? resolve(data) : this.hear(index, data));
+      worker.onmessage = ({ data }) => {
+        if (data.type === "opened") return resolve();
+        if (data.type !== "part") return this.hear(worker, data);
+        relay(index, data);
+        if (data.name === "nodes") this.active = [...this.workers];
+      };
       worker.onerror = (event) => this.onFault(`The model cannot be drawn: ${event.message || "a worker did not start"}.`);
-      worker.postMessage({ type: "open", module, bytes });
+      worker.postMessage({ type: "open", module, bytes, parts: parts[index], alone: !shared });
     })));
+    if (shared) this.workers[0].postMessage({ type: "nodes" });
+  }
+
+  // Whether every worker draws, coarser levels among what they draw.
+  get complete() {
+    return this.active?.length === this.workers.length;
   }
 
   size() {
@@ -74,23 +89,23 @@ class Drawing {
 
   // Hands a frame {width, height, view, output, …} to the workers.
   draw(frame) {
-    Object.assign(frame, { id: this.nextId++, got: 0, started: performance.now(), depths: [], workerMs: [] });
+    Object.assign(frame, { id: this.nextId++, got: 0, started: performance.now(), depths: [], workers: [...this.active], workerMs: [] });
     this.frame = frame;
     frame.buffer = new OffscreenCanvas(frame.width, frame.height).getContext("2d", { alpha: false });
     const [near, far] = this.range || [0, 1], rows = this.rowsOf(Math.ceil(frame.height / 16));
-    this.workers.forEach((worker, i) => worker.postMessage({ type: "draw", id: frame.id, view: frame.view, rows: rows[i],
+    frame.workers.forEach((worker, i) => worker.postMessage({ type: "draw", id: frame.id, view: frame.view, rows: rows[i],
       output: frame.output, near, far, whole: frame.moving }));
   }
 
   rowsOf(count) {
-    const n = this.workers.length, all = Array.from({ length: count }, (_, row) => row);
-    if (!this.isSplats) return this.workers.map((_, i) => all.filter((row) => row % n === i));
+    const n = this.active.length, all = Array.from({ length: count }, (_, row) => row);
+    if (!this.isSplats) return this.active.map((_, i) => all.filter((row) => row % n === i));
     let sum = 0;
     const ends = this.shares.map((share) => Math.round((sum += share) * count));
-    return this.workers.map((_, i) => all.slice(i ? ends[i - 1] : 0, i === n - 1 ? count : ends[i]));
+    return this.active.map((_, i) => all.slice(i ? ends[i - 1] : 0, i === n - 1 ? count : ends[i]));
   }
 
-  hear(index, data) {
+  hear(worker, data) {
     if (data.type === "failed") return this.onFault(data.sentence);
     if (data.type === "picked") return void this.waiting.get(data.id)?.(data.distance);
     const frame = this.frame;
@@ -98,10 +113,11 @@ class Drawing {
     if (data.type === "strip") this.put(frame, data);
     if (data.type !== "done") return;
     data.strips.forEach((strip) => this.put(frame, strip));
+    const index = frame.workers.indexOf(worker);
     frame.workerMs[index] = data.ms;
     if (data.depths[1] > 0) frame.depths.push(data.depths);
     if (data.floats) (frame.floats ||= []).push([index, data.floats]);
-    if (++frame.got === this.workers.length) this.finish(frame);
+    if (++frame.got === frame.workers.length) this.finish(frame);
   }
 
   put(frame, { row, pixels }) {
@@ -178,7 +194,7 @@ class Drawing {
     const view = { ...this.view(camera, width, height, FINE_LOD, [0, 0, 0]) };
     return new Promise((resolve) => {
       this.waiting.set(id, (distance) => (this.waiting.delete(id), resolve(distance)));
-      this.workers[0].postMessage({ type: "pick", id, view, x, y });
+      this.active[0].postMessage({ type: "pick", id, view, x, y });
     });
   }
 }

@@ -10,6 +10,8 @@ const FAULTS = {
   4: "its masks make another number of vertices than it declares",
 };
 
+const PARTS = { corners: [0], values: [1], nodes: [2, 3] };
+
 class ModelError extends Error {}
 
 // The JSON document of a safetensors file, and a function that gives an array's bytes by name.
@@ -45,12 +47,13 @@ async function inflate(bytes, count, fault) {
   } catch {
     throw fault("its numbers are damaged");
   }
-  if (out.length !== count) throw fault("it does not hold as many numbers as it declares");
+  if (count !== null && out.length !== count) throw fault("it does not hold as many numbers as it declares");
   return out;
 }
 
 class Engine {
-  static async open(module, bytes) {
+  // parts: which of "corners", "values" and "nodes" of an octree are made here; others come by `take`.
+  static async open(module, bytes, parts = ["corners", "values", "nodes"]) {
     const nothing = () => 0;
     const imports = { wasi_snapshot_preview1: { fd_close: nothing, fd_seek: nothing, fd_write: nothing } };
     const engine = new Engine();
@@ -62,7 +65,7 @@ class Engine {
     const opener = openers[file.document.format];
     if (!opener || file.document.storage !== "compact") throw file.fault("it is of a kind that this page cannot draw");
     try {
-      await engine[opener](file);
+      await engine[opener](file, parts);
     } catch (error) {
       if (error instanceof ModelError) throw error;
       if (error instanceof RangeError || error instanceof WebAssembly.RuntimeError)
@@ -94,17 +97,53 @@ class Engine {
     }
   }
 
-  async openOctree(file) {
+  async openOctree(file, parts) {
     const d = file.document, codec = d.codec;
     const nodes = file.read("node_mask"), leaves = file.read("leaf_mask");
     if (nodes.length !== leaves.length || !codec) throw file.fault("its parts do not fit together");
     const code = this.wasm.octree_open(this.keep(nodes), this.keep(leaves), nodes.length, d.n_vertices, d.sh_degree,
       ...d.origin, d.size, d.density_scale);
     if (code) throw file.fault(FAULTS[code]);
+    this.lacks = new Set(["corners", "values"]);
+    if (parts.includes("corners")) {
+      const wrong = this.wasm.octree_corners();
+      if (wrong) throw file.fault(FAULTS[wrong]);
+      this.lacks.delete("corners");
+    }
+    if (!parts.includes("values")) return;
     await this.channels(1 + 3 * (d.sh_degree + 1) ** 2, d.n_vertices, file, (index, low, high) =>
       this.wasm.octree_channel(index, low, high, codec.differences[index], index ? codec.sh_step : codec.density_step,
         codec.density_softness));
+    this.lacks.delete("values");
+    if (parts.includes("nodes")) this.makeNodes();
+  }
+
+  // Whether it can draw.
+  get complete() {
+    return !this.lacks || !this.lacks.size;
+  }
+
+  makeNodes() {
+    this.wasm.octree_nodes();
     this.wasm.octree_finish();
+  }
+
+  // A copy of a part of the octree, for others to take: a list of buffers.
+  part(name) {
+    return PARTS[name].map((number) => {
+      const at = this.wasm.octree_part(number, 0) >>> 0;
+      return this.wasm.memory.buffer.slice(at, at + (this.wasm.octree_part_bytes(number) >>> 0));
+    });
+  }
+
+  take(name, buffers) {
+    const row = 64 * [1, 1, 2, 4][this.document.sh_degree];
+    PARTS[name].forEach((number, i) => {
+      const at = this.wasm.octree_part(number, number === 3 ? buffers[i].byteLength / row : 0) >>> 0;
+      new Uint8Array(this.wasm.memory.buffer, at, buffers[i].byteLength).set(new Uint8Array(buffers[i]));
+    });
+    this.lacks.delete(name);
+    if (name === "nodes") this.wasm.octree_finish();
   }
 
   async openSplats(file) {

@@ -11,6 +11,7 @@ import hashlib
 import html
 import io
 import json
+import zlib
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -92,7 +93,7 @@ def build_page(settings: Mapping[str, Any], poster_address: str, model: bytes | 
     parts = {
         "policy": policy, "version": __version__, "title": html.escape(settings["name"]), "style": style,
         "poster": poster_address, "settings": json.dumps(settings, allow_nan=False).replace("<", "\\u003c"),
-        "worker": worker, "kernels": base64.b64encode(resource("kernels.wasm")).decode(),
+        "worker": worker, "kernels": base64.b64encode(zlib.compress(resource("kernels.wasm"), 9)).decode(),
         "model": "" if model is None else model_element(model), "script": script,
     }  # fmt: skip
     pieces = resource("page.html").decode().split("{{")

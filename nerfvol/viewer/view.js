@@ -36,7 +36,7 @@ function fault(sentence) {
 async function open() {
   if (typeof WebAssembly !== "object" || typeof DecompressionStream !== "function" || typeof OffscreenCanvas !== "function")
     throw new ModelError("This browser is too old for this page: it needs one of 2023 or later.");
-  const kernels = await decode($("kernels").textContent.trim());
+  const kernels = await inflate(await decode($("kernels").textContent.trim()), null, (why) => new ModelError(`The page is damaged: ${why}.`));
   const [module, bytes] = await Promise.all([WebAssembly.compile(kernels), remote ? remote.model() : modelBytes()]);
   model = bytes;
   const { document: described } = readArrays(bytes);  // says at once what is cut off

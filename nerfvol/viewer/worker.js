@@ -35,13 +35,36 @@ async function draw(job) {
   self.postMessage({ type: "done", id, ms: performance.now() - started, depths, strips, floats }, all);
 }
 
+let opened = false;
+function ready() {
+  if (!opened) self.postMessage({ type: "opened", bytes: engine.wasm.memory.buffer.byteLength });
+  opened = true;
+}
+
+function give(name) {
+  const buffers = engine.part(name);
+  self.postMessage({ type: "part", name, buffers }, buffers);
+}
+
 let queue = Promise.resolve();
 
 const handlers = {
-  async open({ module, bytes }) {
+  // Several workers share the work: each makes `parts` of an octree and sends them to the others, by way of the page.
+  async open({ module, bytes, parts, alone }) {
     engine = null;  // the old one's memory goes first
-    engine = await Engine.open(module, bytes);
-    self.postMessage({ type: "opened", bytes: engine.wasm.memory.buffer.byteLength });
+    opened = false;
+    engine = await Engine.open(module, bytes, parts.filter((name) => alone || name !== "nodes"));
+    if (!engine.lacks || alone) return ready();
+    for (const name of parts) if (name !== "nodes") give(name);
+    if (engine.complete) ready();
+  },
+  async take({ name, buffers }) {
+    engine.take(name, buffers);
+    if (engine.complete) ready();
+  },
+  async nodes() {
+    engine.makeNodes();
+    give("nodes");
   },
   async draw(job) {
     if (latest <= job.id && engine) await draw(job);
@@ -54,7 +77,6 @@ const handlers = {
 
 self.onmessage = ({ data }) => {
   if (data.type === "draw") latest = data.id;
-  if (data.type === "drop") return void (latest = data.id);
   queue = queue.then(() => handlers[data.type](data)).catch((error) => {
     const known = error instanceof ModelError;
     self.postMessage({ type: "failed", sentence: known ? error.message : `The model cannot be drawn: ${error.message}` });

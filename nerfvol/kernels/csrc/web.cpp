@@ -51,8 +51,8 @@ struct {
 
 constexpr int kDensity = 12;
 
-// Masks to first children, leaves and corners; 0, or the number of what is wrong (engine.js has the sentences).
-int find_leaves(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
+// Masks to first children; 0, or the number of what is wrong (engine.js has the sentences).
+int find_children(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
     octree.first_node.resize(size_t(n));
     octree.first_leaf.resize(size_t(n));
     int64_t nodes = 1, leaves = 0;
@@ -65,6 +65,13 @@ int find_leaves(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
         if (nodes > n || (nodes == i + 1 && i + 1 < n)) return 2;  // more links than nodes, or nodes that hang on nothing
     }
     if (nodes != n || !leaves) return 2;
+    octree.tree.n_leaves = leaves;
+    return 0;
+}
+
+// Places the leaves and numbers their corners; 0, or the number of what is wrong.
+int number_leaves(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
+    const int64_t leaves = octree.tree.n_leaves;
     std::vector<int8_t> level(static_cast<size_t>(leaves));
     std::vector<int32_t> ijk(size_t(3 * leaves)), above = {0, 0, 0}, below;
     int64_t leaf = 0;
@@ -82,10 +89,7 @@ int find_leaves(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
                 std::copy_n(child, 3, ijk.data() + 3 * leaf++);
             }
     }
-    octree.corners.resize(size_t(8 * leaves));
-    octree.tree.n_leaves = leaves;
-    octree.tree.n_vertices = number_corners(level.data(), ijk.data(), leaves, depth, octree.corners.data());
-    return 0;
+    return number_corners(level.data(), ijk.data(), leaves, depth, octree.corners.data()) == octree.tree.n_vertices ? 0 : 4;
 }
 
 // Where coefficient k of channel c lies in a vertex row: nerfvol/octree/rows.py.
@@ -184,9 +188,11 @@ NERFVOL_WEB(release) void web_release(void* p) { ::operator delete[](p, std::ali
 NERFVOL_WEB(octree_open)
 int octree_open(const uint8_t* node_mask, const uint8_t* leaf_mask, int32_t n_nodes, int32_t n_vertices, int degree, float x,
                 float y, float z, float size, float density_scale) {
-    if (const int fault = find_leaves(node_mask, leaf_mask, n_nodes)) return fault;
+    if (const int fault = find_children(node_mask, leaf_mask, n_nodes)) return fault;
     Tree& t = octree.tree;
-    if (t.n_vertices != n_vertices) return 4;
+    if (n_vertices <= t.n_leaves || n_vertices > 8 * t.n_leaves) return 4;
+    t.n_vertices = n_vertices;
+    octree.corners.resize(size_t(8 * t.n_leaves));
     t.node_mask = node_mask;
     t.leaf_mask = leaf_mask;
     t.n_nodes = n_nodes;
@@ -226,9 +232,34 @@ void octree_channel(int channel, const uint8_t* low, const uint8_t* high, int di
     }
 }
 
-NERFVOL_WEB(octree_finish) void octree_finish() {
+// What takes long can be made by one instance and taken by others: corners here, values by octree_channel, nodes at last.
+NERFVOL_WEB(octree_corners) int octree_corners() {
+    return number_leaves(octree.tree.node_mask, octree.tree.leaf_mask, octree.tree.n_nodes);
+}
+
+NERFVOL_WEB(octree_nodes) void octree_nodes() {
     codes = {};
     octree.nodes = prefilter(octree.tree);
+}
+
+// The parts: 0 corners, 1 values, 2 and 3 the nodes' corners and values. `rows`: makes room for so many of part 3 first.
+NERFVOL_WEB(octree_part) void* octree_part(int part, int rows) {
+    if (rows > 0) octree.nodes.values.resize(size_t(rows) * 16 * size_t(octree.tree.blocks));
+    if (part == 0) return octree.corners.data();
+    if (part == 1) return octree.values;
+    if (octree.nodes.corners.empty()) octree.nodes.corners.resize(size_t(8 * octree.tree.n_nodes));
+    return part == 2 ? static_cast<void*>(octree.nodes.corners.data()) : octree.nodes.values.data();
+}
+
+NERFVOL_WEB(octree_part_bytes) uint32_t octree_part_bytes(int part) {
+    const Tree& t = octree.tree;
+    const size_t bytes[4] = {32 * size_t(t.n_leaves), 64 * size_t(t.blocks) * size_t(t.n_vertices), 32 * size_t(t.n_nodes), 4 * octree.nodes.values.size()};
+    return uint32_t(bytes[part]);
+}
+
+// From now on nodes are drawn in place of their leaves where they are small.
+NERFVOL_WEB(octree_finish) void octree_finish() {
+    codes = {};
     octree.tree.node_corners = octree.nodes.corners.data();
     octree.tree.node_values = octree.nodes.values.data();
 }
@@ -301,7 +332,7 @@ NERFVOL_WEB(begin) void web_begin() {
     picture.median.resize(wanted & kWantMedian ? n : 0);
     picture.normal.resize(wanted & kWantNormal ? 3 * n : 0);
     pixels.resize(4 * n);
-    octree.tree.coarse = float(view.coarse);
+    octree.tree.coarse = octree.tree.node_values ? float(view.coarse) : 0.0f;
 }
 
 // Of splats: projects and sorts what rows [first, last) of 16 pixels need. To be called before `draw` draws them.
