@@ -68,6 +68,7 @@ class Engine {
       await engine[opener](file, parts);
     } catch (error) {
       if (error instanceof ModelError) throw error;
+      if (error instanceof TypeError) throw file.fault("its header is damaged");
       if (error instanceof RangeError || error instanceof WebAssembly.RuntimeError)
         throw new ModelError("This model needs more memory than the browser gives to a page.");
       throw error;

@@ -16,7 +16,11 @@ async function decode(text) {
   return new Uint8Array(await (await fetch("data:application/octet-stream;base64," + text)).arrayBuffer());
 }
 
+// The model is the last thing in the file; the interface is there before it.
+const loaded = new Promise((done) => (document.readyState === "loading" ? document.addEventListener("DOMContentLoaded", done) : done()));
+
 async function modelBytes() {
+  await loaded;
   const element = $("model");
   if (!element) throw new ModelError("The model in this page is missing: the file is cut off.");
   const text = element.textContent;
