@@ -29,7 +29,8 @@ DRAG = """async (seconds) => {
     step();
   });
   send("pointerup", 0, 0);
-  const from = started + 1000 * Math.min(1.5, seconds / 3), kept = drawing.stats.times.map((t, i) => [t, drawing.stats.latency[i]])
+  const from = started + 1000 * Math.min(1.5, seconds / 3);
+  const kept = drawing.stats.times.map((t, i) => [t, drawing.stats.latency[i]])
     .filter(([t]) => t > from && t < started + 1000 * seconds);
   const middle = kept.map((k) => k[1]).sort((a, b) => a - b)[Math.floor(kept.length / 2)];
   return {rate: kept.length / (seconds - (from - started) / 1000), latency: middle, width: drawing.canvas.width,
@@ -86,9 +87,12 @@ def main() -> int:
     size = given.page.stat().st_size
     if given.model:
         model = given.model.stat().st_size
-        print(f"page {size / 1e6:.2f} MB, model {model / 1e6:.2f} MB: 1.36 x model + {(size - 1.36 * model) / 1e6:.2f} MB")
+        print(
+            f"page {size / 1e6:.2f} MB, model {model / 1e6:.2f} MB: 1.36 x model + {(size - 1.36 * model) / 1e6:.2f} MB"
+        )
     print(f"first picture {r['first']:.2f} s; window {given.size}, {workers} workers")
-    print(f"dragging: {r['rate']:.1f} pictures/s of {r['width']}x{r['height']} at LOD {r['lod']:.2f}, {r['latency']:.0f} ms from event to pixels")
+    shown = f"{r['rate']:.1f} pictures/s of {r['width']}x{r['height']} at LOD {r['lod']:.2f}"
+    print(f"dragging: {shown}, {r['latency']:.0f} ms from event to pixels")
     print(f"whole picture 800x800: {r['whole']:.2f} s")
     return 0
 

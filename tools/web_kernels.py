@@ -58,9 +58,13 @@ def main() -> int:
     for compiler in compilers():
         with tempfile.TemporaryDirectory() as folder:
             made = Path(folder) / "kernels.wasm"
-            done = subprocess.run([*compiler, *FLAGS, *UNITS, "-o", str(made), *LINK], cwd=SOURCES, capture_output=True, text=True)
+            done = subprocess.run(
+                [*compiler, *FLAGS, *UNITS, "-o", str(made), *LINK], cwd=SOURCES, capture_output=True, text=True
+            )
             if done.returncode:
-                said.append(f"{' '.join(compiler)}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'failed'}")
+                said.append(
+                    f"{' '.join(compiler)}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'failed'}"
+                )
                 continue
             sys.stderr.write(done.stderr)
             version = subprocess.run([*compiler[:1], "--version"] if len(compiler) == 2 else [*compiler[:3], "version"],
@@ -70,7 +74,9 @@ def main() -> int:
         STAMP.write_text(json.dumps(stamp, indent=1) + "\n")
         print(f"{OUT.relative_to(ROOT)}: {OUT.stat().st_size} bytes from {len(stamp['sources'])} files, {version}")
         return 0
-    print("no compiler for WebAssembly: install clang, lld and wasi-libc, or ziglang", *said, sep="\n  ", file=sys.stderr)
+    print(
+        "no compiler for WebAssembly: install clang, lld and wasi-libc, or ziglang", *said, sep="\n  ", file=sys.stderr
+    )
     return 1
 
 

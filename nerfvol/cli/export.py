@@ -41,7 +41,9 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--resolution", metavar="N", help="grid: samples along the longest side (default: 256)")
     p.add_argument("--quantity", metavar="sigma|opacity", help="grid: density in 1/scene unit, or the opacity of a voxel "
                    "along its side (default: sigma)")  # fmt: skip
-    p.add_argument("--level", metavar="L", help="page: the octree's finest leaves are 1/2^L of its cube (default: as it is)")
+    p.add_argument(
+        "--level", metavar="L", help="page: the octree's finest leaves are 1/2^L of its cube (default: as it is)"
+    )
     p.add_argument("--max-bytes", metavar="SIZE", help="page: the file's most bytes, such as 2MB; draws the least visible "
                    "parts coarser (default: any)")  # fmt: skip
     p.add_argument("--crop", metavar="X0,Y0,Z0,X1,Y1,Z1", help="page: only what lies in this box, scene units")
@@ -58,7 +60,9 @@ def run(options: ExportOptions) -> int:
     choose(options.out, target.model.kind, options.format)
     prepare_outputs(file=options.out)
     set_threads(options.threads)
-    given = {name: getattr(options, name) for name in ("threshold", "resolution", "quantity", "level", "max_bytes", "crop")}
+    given = {
+        name: getattr(options, name) for name in ("threshold", "resolution", "quantity", "level", "max_bytes", "crop")
+    }
     row, size = export_model(target.model, options.out, options.format, **given)
     print(f"{options.out}: {row.name}, {size / 1e6:.1f} MB; opened by {row.opened_by}")
     return 0

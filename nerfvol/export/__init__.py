@@ -117,7 +117,9 @@ def export_model(
     given = {key: value for key, value in options.items() if value is not None}
     if surplus := [key for key in given if key not in row.options]:
         takers = [r.name for r in EXPORTS if surplus[0] in r.options]
-        raise InputError(f"--{surplus[0].replace('_', '-')} is no option of the format {row.name}, but of {_listed(takers)}")
+        raise InputError(
+            f"--{surplus[0].replace('_', '-')} is no option of the format {row.name}, but of {_listed(takers)}"
+        )
     module = importlib.import_module(row.module)
     needed, free = module.memory(model, **given), available_memory() if free is None else free
     if free is not None and needed > 0.9 * free:

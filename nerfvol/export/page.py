@@ -1,37 +1,50 @@
-"""``.html``: the model in a page that draws it, one file that opens by a double click (viewer/page.py says what is in it).
+"""``.html``: the model in a page that draws it: interface, kernels as WebAssembly and model in one file for a double click.
 
-Models are stored compact; a limit of bytes is kept by drawing the least visible parts coarser: an octree's cells level by level,
-those first that differ least from what is drawn in their place; of splats the smallest and faintest are left out.
+Models are stored compact (page_size.py keeps a limit of bytes). The page asks the network for nothing; its
+Content-Security-Policy says so to the browser. Everything in it but the model is fixed text of the package ``viewer``, whose
+hashes the policy names, and escaped words.
 """
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html
+import io
+import json
 import os
-import tempfile
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nerfvol import __version__
+from nerfvol.cameras.camera import Camera, Intrinsics
+from nerfvol.cameras.paths import default_orbit, orbit_cameras
+from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
+from nerfvol.export.page_size import fitted, stored
 from nerfvol.files.atomic import write_text
+from nerfvol.files.page import model_element
+from nerfvol.files.pictures import to_uint8
 from nerfvol.models import Model
 from nerfvol.octree import lod
-from nerfvol.octree.io import save_octree
-from nerfvol.octree.topology import POPCOUNT, level_starts
-from nerfvol.octree.tree import Octree
-from nerfvol.splats.io import save_splats
 from nerfvol.splats.splats import Splats
-from nerfvol.viewer.page import build_page, page_settings, poster
-from nerfvol.views import OctreeModel, SplatModel
+from nerfvol.views import OctreeModel, SplatModel, depth_range
 
-TOLERANCE = 0.04
-"""Of the limit: a page that much smaller is not made larger again."""
-MOST_TRIALS = 8
+POSTER_SIZE = (1120, 630)
+POSTER_BYTES = 60_000
+ENGINE = ("engine.js", "worker.js")
+PAGE = ("engine.js", "camera.js", "draw.js", "view.js")
 
 
-def memory(model: Model, level: int | None = None, max_bytes: int | None = None, crop: Sequence[float] | None = None) -> int:
+def memory(
+    model: Model, level: int | None = None, max_bytes: int | None = None, crop: Sequence[float] | None = None
+) -> int:
     """Bytes that writing takes: a coarser copy, codes, the page's text."""
     if isinstance(model, OctreeModel):
         return 3 * model.octree.values.nbytes + 100 * model.octree.n_leaves
@@ -67,20 +80,8 @@ def page_text(
         return page
     room = (max_bytes - (len(page) - 4 * -(-len(data) // 3))) * 3 // 4
     if room < 2000:
-        raise InputError(f"a page without its model takes {len(page) * 1.0 - len(data) * 4 / 3:,.0f} bytes, --max-bytes is {max_bytes}")
-    return build_page(settings, picture, _fitted(part, len(data), room))
-
-
-def stored(model: Model) -> bytes:
-    """The bytes of the model's compact file."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.safetensors"
-        if isinstance(model, OctreeModel):
-            save_octree(path, model.octree, model.metadata, "compact")
-        else:
-            model = model if isinstance(model, SplatModel) else SplatModel(model.splats, model.metadata)  # type: ignore[attr-defined]
-            save_splats(path, model.splats, {**model.metadata, "near": model.near}, compact=True)
-        return path.read_bytes()
+        raise InputError(f"--max-bytes is {max_bytes}, the page takes {len(page) - len(data) * 4 // 3} without a model")
+    return build_page(settings, picture, fitted(part, len(data), room))
 
 
 def _part(model: Model, level: int | None, crop: Sequence[float] | None) -> Model:
@@ -107,96 +108,79 @@ def _inside(places: NDArray, crop: Sequence[float]) -> NDArray[np.bool_]:
     return inside
 
 
-def _fitted(model: Model, size: int, room: int) -> bytes:
-    """The model's compact file in at most ``room`` bytes; as it is it has ``size``."""
-    if isinstance(model, OctreeModel):
-        coarser = _coarsening(model.octree)
-        return _largest(lambda share: stored(OctreeModel(coarser(share), model.metadata)), room)
-    return _fitted_splats(model, size, room)
+def resource(name: str) -> bytes:
+    """A file of this package; InputError where the installation lacks it."""
+    try:
+        return resources.files("nerfvol.viewer").joinpath(name).read_bytes()
+    except FileNotFoundError as error:
+        hint = "; make wasm builds it" if name.endswith(".wasm") else ""
+        raise InputError(f"this installation of nerfvol lacks viewer/{name}{hint}") from error
 
 
-def _largest(make: Callable[[float], bytes], room: int) -> bytes:
-    """``make(share)`` for nearly the largest share in (0, 1] whose bytes fit: they grow with the share."""
-    low, high, best = 0.0, 1.0, None
-    share = 0.5
-    for _ in range(MOST_TRIALS):
-        data = make(share)
-        if len(data) <= room:
-            low, best = share, data
-            if len(data) >= (1 - TOLERANCE) * room:
-                break
-        else:
-            high = share
-        # bytes are nearly proportional to the share; never leave the bracket
-        share = float(np.clip(share * 0.985 * room / len(data), low + 0.02 * (high - low), high - 0.02 * (high - low)))
-    if best is None:
-        raise InputError("--max-bytes leaves too little room for the coarsest model")
-    return best
+def page_settings(model: Model, name: str) -> dict[str, Any]:
+    """What the page knows of a model before it has opened it: words, background, orbit, range of depths; JSON-able."""
+    stored = model.metadata.get("orbit")
+    known = isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys()
+    orbit = dict(stored) if known else default_orbit(model.aabb())
+    cameras = orbit_cameras(4, orbit, (96, 96))
+    return {
+        "name": name, "orbit": orbit, "background": list(model.metadata.get("background", WHITE)),
+        "depths": list(depth_range(model, cameras)),
+    }  # fmt: skip
 
 
-def _coarsening(octree: Octree) -> Callable[[float], Octree]:
-    """share -> the octree in which the least visible nodes are closed until that share of the leaves is left, in cost order.
-
-    The cost of closing a node, drawn as one cell: its surface as seen, side squared, times the mean square by which its
-    children's opacities and colours differ from its own; never less than that of a node inside it, so that what is open hangs
-    together.
-    """
-    nodes = lod.prefiltered_nodes(octree)
-    starts = level_starts(octree.node_mask)
-    cost = np.zeros(octree.n_nodes)
-    for level in range(len(starts) - 2, 0, -1):
-        first, last = starts[level], starts[level + 1]
-        side = octree.size / 2.0**level
-        own = _mean_rows(octree, nodes.values, nodes.corners[first:last], side)
-        total = np.zeros(last - first)
-        for mask, begin, cells, rows, is_node in (
-            (octree.leaf_mask, octree.first_leaf, octree.corners, octree.values, False),
-            (octree.node_mask, octree.first_node, nodes.corners, nodes.values, True),
-        ):
-            counts = POPCOUNT[mask[first:last]]
-            parent = np.repeat(np.arange(last - first), counts)
-            if not len(parent):
-                continue
-            child = int(begin[first]) + np.arange(len(parent))
-            seen = _mean_rows(octree, rows, cells[child], side)
-            np.add.at(total, parent, ((seen - own[parent]) ** 2).sum(1) / 8)
-            if is_node:
-                np.maximum.at(cost, first + parent, cost[child] * (1 + 1e-9))
-        cost[first:last] = np.maximum(cost[first:last], total * side**2)
-    removed = np.array([7.0])  # leaves that closing a node takes away, about
-    order = np.sort(cost[1:]) if octree.n_nodes > 1 else removed
-
-    def coarser(share: float) -> Octree:
-        closed = cost < order[min(int((1 - share) * len(order)), len(order) - 1)]
-        closed[0] = False
-        return lod.closed(octree, closed)
-
-    return coarser
+def first_camera(orbit: Mapping[str, Any], width: int, height: int) -> Camera:
+    """The page's first view in a picture of this size: the orbit's first, whose shorter side fills the shorter side."""
+    camera = orbit_cameras(1, orbit, None)[0]
+    lens = camera.intrinsics
+    focal = lens.fx * min(width, height) / min(lens.width, lens.height)
+    return Camera(Intrinsics(width, height, focal, focal, width / 2, height / 2), camera.c2w)
 
 
-def _mean_rows(octree: Octree, rows: NDArray, corners: NDArray, side: float) -> NDArray:
-    """What cells look like, (n, 4): opacity along ``side`` and colour times opacity, at the mean of the corners."""
-    mean = np.zeros((len(corners), rows.shape[1]), np.float32)
-    for o in range(8):
-        mean += rows[corners[:, o]] / 8
-    opacity = -np.expm1(-octree.density_scale * lod.explin(mean[:, 12]) * side)
-    colour = 0.5 + 0.28209479177387814 * mean[:, [0, 4, 8]]
-    return np.column_stack([opacity, colour * opacity[:, None]])
+def poster(model: Model, settings: Mapping[str, Any]) -> str:
+    """The first view as a WebP of at most POSTER_BYTES, as a data: address."""
+    from PIL import Image
+
+    picture = model.render(first_camera(settings["orbit"], *POSTER_SIZE), settings["background"])["rgb"]
+    image = Image.fromarray(to_uint8(picture))
+    for quality in (80, 60, 40, 20, 5):
+        data = io.BytesIO()
+        image.save(data, "WEBP", quality=quality, method=4)
+        if data.tell() <= POSTER_BYTES:
+            break
+    return "data:image/webp;base64," + base64.b64encode(data.getvalue()).decode()
 
 
-def _fitted_splats(model: Model, size: int, room: int) -> bytes:
-    splats: Splats = model.splats  # type: ignore[attr-defined]
-    while splats.sh_degree > 0 and room < 0.6 * size:  # finer colours are worth less than half of the splats
-        splats = splats.with_sh_degree(splats.sh_degree - 1)
-        size = len(stored(SplatModel(splats, model.metadata)))
-    sizes = np.sort(splats.log_scales.astype(np.float64), axis=1)
-    weight = 1 / (1 + np.exp(-splats.logits.astype(np.float64))) * np.exp(sizes[:, 1] + sizes[:, 2])
-    order = np.argsort(-weight, kind="stable")
-    whole = stored(SplatModel(splats, model.metadata))
-    if len(whole) <= room:
-        return whole
+def build_page(
+    settings: Mapping[str, Any], poster_address: str, model: bytes | None, extra: tuple[str, ...] = ()
+) -> str:
+    """The page's text. model: the file in it, compact; None: it comes from a server, by the scripts ``extra``."""
+    script = "const remote = null;\n" if model is not None else ""
+    names = (*PAGE[:-1], *extra, PAGE[-1])
+    script += "\n".join(resource(name).decode().replace('"use strict";', "") for name in names)
+    script = f'"use strict";\n{script}'
+    style = resource("style.css").decode()
+    worker = "\n".join(resource(name).decode() for name in ENGINE)
+    for text in (script, worker):
+        assert "</script" not in text
+    served = " 'self'" if model is None else ""
+    policy = (
+        f"default-src 'none'; script-src {_hash(script)} 'wasm-unsafe-eval' blob:; style-src {_hash(style)}; "
+        f"img-src data: blob:{served}; worker-src blob:; connect-src data:{served}; base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "policy": policy, "version": __version__, "title": html.escape(settings["name"]), "style": style,
+        "poster": poster_address, "settings": json.dumps(settings, allow_nan=False).replace("<", "\\u003c"),
+        "worker": worker, "kernels": base64.b64encode(zlib.compress(resource("kernels.wasm"), 9)).decode(),
+        "model": "" if model is None else model_element(model), "script": script,
+    }  # fmt: skip
+    pieces = resource("page.html").decode().split("{{")
+    out = [pieces[0]]
+    for piece in pieces[1:]:
+        name, _, rest = piece.partition("}}")
+        out += [parts[name], rest]
+    return "".join(out)
 
-    def make(share: float) -> bytes:
-        return stored(SplatModel(splats.select(np.sort(order[: max(1, int(share * splats.n))])), model.metadata))
 
-    return _largest(make, room)
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

@@ -1,10 +1,10 @@
 """Compact storage of splats: quantised, decorrelated, predicted, deflated; about a quarter of the bytes of float32.
 
-Splats are put in Morton order, so that neighbours in the file are neighbours in space, and every number becomes a 16-bit code of
-a channel, packed as an octree's (octree/codec.py). Channels, in this order:
+Splats are put in Morton order, so that neighbours in the file are neighbours in space, and every number becomes a 16-bit
+code of a channel, packed as an octree's (octree/codec.py). Channels, in this order:
 
-- 0-2: means, asinh((mean - middle) / extent) / POSITION_STEP divided by 256 and rounded down; 3-5: what is left, 0..255. Fine in
-  the middle of a scene, relative far outside; middle and extent are those of most splats.
+- 0-2: means, asinh((mean - middle) / extent) / POSITION_STEP divided by 256 and rounded down; 3-5: what is left, 0..255.
+  Fine in the middle of a scene, relative far outside; middle and extent are those of most splats.
 - 6-8: log-scales / SCALE_STEP; 9-11: rotation vectors (axis times angle, at most pi) / ROTATION_STEP; 12: logits / LOGIT_STEP.
 - 13 + axis K + k: colour coefficient k of grey, red-blue and green-magenta / DC_STEP (k = 0) or SH_STEP.
 """
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from nerfvol.octree.codec import TO_GREY, Bytes, pack_codes, plane_name, round_codes, unpack_codes
 from nerfvol.octree.topology import morton
-
 from nerfvol.splats.points import Y00
 from nerfvol.splats.splats import Splats
 
@@ -65,11 +64,17 @@ def encode(splats: Splats) -> tuple[dict[str, Bytes], dict[str, Any]]:
         "rotation_step": ROTATION_STEP, "logit_step": LOGIT_STEP, "dc_step": float(DC_STEP), "sh_step": float(SH_STEP),
         "differences": [int(differences) for differences, _ in packed],
     }  # fmt: skip
-    names = [(plane_name(i, plane), data) for i, (_, pair) in enumerate(packed) for plane, data in zip(("low", "high"), pair, strict=True)]
+    names = [
+        (plane_name(i, plane), data)
+        for i, (_, pair) in enumerate(packed)
+        for plane, data in zip(("low", "high"), pair, strict=True)
+    ]
     return {name: np.frombuffer(data, np.uint8) for name, data in names}, parameters
 
 
-def decode(n: int, basis: int, read: Callable[[str], Bytes], parameters: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
+def decode(
+    n: int, basis: int, read: Callable[[str], Bytes], parameters: Mapping[str, Any]
+) -> dict[str, NDArray[np.float32]]:
     """means, log_scales, quats, logits and sh of ``n`` splats by name; ``read`` gives a byte plane by name.
 
     Raises:
@@ -79,7 +84,11 @@ def decode(n: int, basis: int, read: Callable[[str], Bytes], parameters: Mapping
     differences, middle = parameters.get("differences"), parameters.get("middle")
     if not isinstance(differences, list) or len(differences) != n_channels(basis):
         raise ValueError(f"its codec parameter 'differences' is not a list of {n_channels(basis)}")
-    if not isinstance(middle, list) or len(middle) != 3 or not all(type(x) in (int, float) and abs(x) < 1e15 for x in middle):
+    if (
+        not isinstance(middle, list)
+        or len(middle) != 3
+        or not all(type(x) in (int, float) and abs(x) < 1e15 for x in middle)
+    ):
         raise ValueError("its codec parameter 'middle' is not a list of three numbers")
 
     def channel(index: int) -> NDArray[np.float32]:

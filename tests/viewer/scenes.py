@@ -6,7 +6,14 @@ from nerfvol.octree.tree import Octree
 from nerfvol.splats.splats import Splats
 from nerfvol.views import OctreeModel, SplatModel
 
-ORBIT = {"center": [0.0, 0.0, 0.0], "radius": 3.0, "elevation_deg": 20.0, "up": [0.0, 0.0, 1.0], "camera_angle_x": 0.8, "size": [300, 200]}
+ORBIT = {
+    "center": [0.0, 0.0, 0.0],
+    "radius": 3.0,
+    "elevation_deg": 20.0,
+    "up": [0.0, 0.0, 1.0],
+    "camera_angle_x": 0.8,
+    "size": [300, 200],
+}
 METADATA = {"background": [1.0, 0.9, 0.7], "orbit": ORBIT, "provenance": {}}
 
 

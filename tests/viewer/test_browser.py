@@ -1,4 +1,4 @@
-"""The page in a real browser, from a file: what it draws, how pointers and keys move the camera, what it asks the network for."""
+"""The page in a real browser, from a file: what it draws, how the camera moves, what it asks the network for."""
 
 import base64
 import json
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.paths import load_cameras
-from nerfvol.export.page import write
+from nerfvol.export.page import first_camera, write
 from nerfvol.files.page import OPENING
 from nerfvol.models import load_model
-from nerfvol.viewer.page import first_camera
 
 from .browser import DRAWN, launch, wait
 from .scenes import ball, cloud_of_splats
@@ -39,7 +38,9 @@ def opened(browser, path, width=WIDTH, height=HEIGHT, until=DRAWN):
     page = browser.new_page(viewport={"width": width, "height": height})
     page.asked, page.faults = [], []
     page.on("request", lambda request: page.asked.append(request.url))
-    page.on("console", lambda message: page.faults.append(message.text) if message.type in ("error", "warning") else None)
+    page.on(
+        "console", lambda message: page.faults.append(message.text) if message.type in ("error", "warning") else None
+    )
     page.on("pageerror", lambda error: page.faults.append(str(error)))
     page.goto(path.as_uri())
     wait(page, until)
@@ -173,7 +174,9 @@ def test_keys_fly_turn_and_choose(fresh):
     fresh.keyboard.press("r")
     assert np.allclose(camera(fresh)["position"], before["position"])
     fresh.keyboard.press("ArrowRight")
-    assert math.atan2(*camera(fresh)["position"][1::-1]) == pytest.approx(math.atan2(*before["position"][1::-1]) - math.pi / 36)
+    assert math.atan2(*camera(fresh)["position"][1::-1]) == pytest.approx(
+        math.atan2(*before["position"][1::-1]) - math.pi / 36
+    )
     fresh.keyboard.press("3")
     assert fresh.evaluate("nerfvol.drawing.output") == 1
     fresh.keyboard.press("1")
@@ -254,7 +257,8 @@ def test_it_fits_a_narrow_screen(browser, files):
     for name in ("path", "outputs"):
         page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
         assert page.is_visible(f"#{name}")
-    wide = page.evaluate("[...document.querySelectorAll('body *')].filter((e) => e.id !== 'poster' && e.getBoundingClientRect().right > 360.5).map((e) => e.outerHTML.slice(0, 60))")
+    beyond = "(e) => e.id !== 'poster' && e.getBoundingClientRect().right > 360.5"
+    wide = page.evaluate(f"[...document.querySelectorAll('body *')].filter({beyond}).map((e) => e.outerHTML)")
     assert wide == [] and page.evaluate("document.documentElement.scrollWidth") <= 360
     assert page.evaluate("document.getElementById('canvas').clientWidth") == 360
     page.close()

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.paths import orbit_cameras
-from nerfvol.export.page import stored
+from nerfvol.export.page import resource
+from nerfvol.export.page_size import stored
 from nerfvol.models import load_model
 from nerfvol.native import native
-from nerfvol.viewer.page import resource
 
 from .scenes import ball, cloud_of_splats
 
@@ -44,7 +44,11 @@ def test_the_kernels_were_made_from_these_sources():
     if not CSRC.is_dir():
         pytest.skip("the sources are not here")
     stamp = json.loads(resource("kernels.json"))
-    stale = [name for name, digest in stamp["sources"].items() if hashlib.sha256((CSRC / name).read_bytes()).hexdigest() != digest]
+    stale = [
+        name
+        for name, digest in stamp["sources"].items()
+        if hashlib.sha256((CSRC / name).read_bytes()).hexdigest() != digest
+    ]
     assert not stale, f"{', '.join(stale)} changed since kernels.wasm was built: run make wasm and commit what it makes"
     assert hashlib.sha256(resource("kernels.wasm")).hexdigest() == stamp["wasm"]
     assert {"web.cpp", "simd.h", "render.h", "splat_render.h", "topology.cpp"} <= stamp["sources"].keys()
@@ -58,7 +62,12 @@ def run_node(folder: Path, tasks: list[dict]) -> None:
     (folder / "driver.js").write_text(DRIVER)
     (folder / "engine.js").write_bytes(resource("engine.js"))
     (folder / "job.json").write_text(json.dumps({"kernels": str(kernels), "tasks": tasks}))
-    done = subprocess.run([node, folder / "driver.js", folder / "engine.js", folder / "job.json"], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [node, folder / "driver.js", folder / "engine.js", folder / "job.json"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -91,14 +100,23 @@ def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("node")
     if native() is None:
         pytest.skip("needs the compiled kernels")
-    models = {f"octree{d}": ball(d) for d in range(4)} | {f"splats{d}": cloud_of_splats(d, mode="plain" if d == 2 else "mip") for d in range(4)}
+    models = {f"octree{d}": ball(d) for d in range(4)} | {
+        f"splats{d}": cloud_of_splats(d, mode="plain" if d == 2 else "mip") for d in range(4)
+    }
     bands, tasks, native_pictures = [[0, 3], [3, 7]], [], {}
     for name, model in models.items():
         path = folder / f"{name}.safetensors"
         path.write_bytes(stored(model))
         model, camera = load_model(path), orbit_cameras(5, model.metadata["orbit"], SIZE)[2]
         for lod in (0.0, 20.0) if name.startswith("octree") else (0.0,):
-            tasks.append({"model": str(path), "view": web_view(camera, lod), "bands": bands, "out": str(folder / f"{name}_{lod:g}.bin")})
+            tasks.append(
+                {
+                    "model": str(path),
+                    "view": web_view(camera, lod),
+                    "bands": bands,
+                    "out": str(folder / f"{name}_{lod:g}.bin"),
+                }
+            )
             outputs = ("rgb", "opacity", "depth", "median_depth", "normal")
             native_pictures[name, lod] = model.render(camera, BACKGROUND, outputs, EPS, lod), Path(tasks[-1]["out"])
     run_node(folder, tasks)
@@ -145,7 +163,14 @@ def test_damaged_models_get_a_sentence(tmp_path):
                 for at in rng.integers(0, len(data), 4 * i):
                     bad[at] = rng.integers(0, 256)
             (tmp_path / f"{kind}{i}").write_bytes(bytes(bad))
-            tasks.append({"model": str(tmp_path / f"{kind}{i}"), "view": web_view(camera, 0.0), "bands": [[0, 2]], "out": str(tmp_path / f"{kind}{i}.out")})
+            tasks.append(
+                {
+                    "model": str(tmp_path / f"{kind}{i}"),
+                    "view": web_view(camera, 0.0),
+                    "bands": [[0, 2]],
+                    "out": str(tmp_path / f"{kind}{i}.out"),
+                }
+            )
     run_node(tmp_path, tasks)
     for task in tasks[:4] + tasks[12:16]:
         said = Path(task["out"]).read_bytes()
