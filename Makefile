@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint sanitize clang no-compiler clean
+.PHONY: demo test lint sanitize clang no-compiler wasm clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -37,6 +37,10 @@ clang: $(BIN)/python
 no-compiler: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python tools/no_compiler.py
+
+# The kernels of web pages; what it makes is committed (tools/web_kernels.py says what it takes).
+wasm:
+	$(PYTHON) tools/web_kernels.py
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

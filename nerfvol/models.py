@@ -18,6 +18,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 from nerfvol.files.arrayfile import ArrayFile
+from nerfvol.files.page import model_file
 from nerfvol.files.run_folder import model_path
 
 Float = NDArray[np.float32]
@@ -70,35 +71,36 @@ SUFFIXES = {
 
 
 def load_model(target: str | os.PathLike[str]) -> Model:
-    """The model in a run folder or a file: our own octrees and splats, Gaussians or points in a .ply, Gaussians in a .spz, a
-    PlenOctree in an .npz.
+    """The model in a run folder or a file: our own octrees and splats, also in a page (.html), Gaussians or points in a .ply,
+    Gaussians in a .spz, a PlenOctree in an .npz.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.
     """
-    path = model_path(target)
-    opener = SUFFIXES.get(path.suffix.lower())
-    if opener is None:
-        stated = str(describe_file(path).get("format"))
-        if stated not in FORMATS:
-            raise InputError(f"{path}: its format is {stated!r}, expected one of {', '.join(FORMATS)}")
-        opener = FORMATS[stated]
-    module, _, name = opener.partition(":")
-    return cast(Model, operator.attrgetter(name)(importlib.import_module(module))(path))
+    with model_file(model_path(target)) as path:
+        opener = SUFFIXES.get(path.suffix.lower())
+        if opener is None:
+            stated = str(describe_file(path).get("format"))
+            if stated not in FORMATS:
+                raise InputError(f"{path}: its format is {stated!r}, expected one of {', '.join(FORMATS)}")
+            opener = FORMATS[stated]
+        module, _, name = opener.partition(":")
+        return cast(Model, operator.attrgetter(name)(importlib.import_module(module))(path))
 
 
 def describe_file(target: str | os.PathLike[str]) -> dict[str, Any]:
     """The JSON document in a model's file; of other programs' files the format alone."""
-    path = model_path(target)
-    if path.suffix.lower() in SUFFIXES:
-        return {"format": path.suffix.lower()}
-    try:
-        with ArrayFile(path, "model file") as file:
-            return file.document
-    except InputError as error:
-        raise InputError(
-            f"{error} (a model is a run folder, its .safetensors file, {' or '.join(SUFFIXES)})"
-        ) from error
+    named = model_path(target)
+    if named.suffix.lower() in SUFFIXES:
+        return {"format": named.suffix.lower()}
+    with model_file(named) as path:
+        try:
+            with ArrayFile(path, "model file") as file:
+                return file.document
+        except InputError as error:
+            raise InputError(
+                f"{error} (a model is a run folder, its .safetensors file, a page, {' or '.join(SUFFIXES)})"
+            ) from error
 
 
 def save_model(path: str | os.PathLike[str], model: Model, storage: str = "compact") -> int:

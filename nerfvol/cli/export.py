@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,25 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
-from nerfvol.config.values import Count, box, fraction
+from nerfvol.config.values import Count, box, byte_count, fraction
 from nerfvol.export import EXPORTS, choose, export_model
 
 if TYPE_CHECKING:
     from nerfvol.export.surface import Cameras
-
-_UNITS = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9}
-
-
-def byte_count(value: Any) -> Any:
-    """A number of bytes from 2000000, "500kB", "2MB" or "1.5G"; None stays. ValueError for others."""
-    match = re.fullmatch(r"([0-9.]+)\s*([kmg]?)b?", str(value).strip().lower())
-    try:
-        count = None if value is None else int(float(match[1]) * _UNITS[match[2]]) if match else 0
-    except ValueError:
-        count = 0
-    if count is not None and count < 1:
-        raise ValueError(f"expected a size such as 500kB, 2MB or 1GB, got {value!r}")
-    return count
 
 
 @dataclass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -310,6 +311,16 @@ def pixels(value: Any) -> Any:
     if not 0.0 <= number < math.inf:
         raise ValueError(f"expected a number of pixels, 0 (off) or more, got {shown(value)}")
     return number
+
+
+def byte_count(value: Any) -> Any:
+    """Bytes from a number or "2MB", "500kB", "1.5 GB" (powers of ten); None stays. Raises ValueError for others."""
+    if value is None or type(value) is int and value > 0:
+        return value
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kMG]?)B?\s*", str(value), re.IGNORECASE)
+    if match is None or not (count := round(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " "))):
+        raise ValueError(f"expected bytes such as 2000000, 500kB or 2MB, got {value!r}")
+    return count
 
 
 def box(value: Any) -> Any:

@@ -62,6 +62,9 @@ EXPORTS: tuple[Export, ...] = (
     Export("htg", (".htg",), "nerfvol.export.htg", ("octree",), "ParaView 5.11 and later", levels=True),
     Export("transforms", (".json",), "nerfvol.export.transforms", ALL, "nerfstudio, instant-ngp", ("cameras",)),
     Export("colmap", ("",), "nerfvol.export.colmap", ALL, "COLMAP, 3DGS trainers, OpenMVS (a folder)", ("cameras",)),
+    Export(
+        "page", (".html",), "nerfvol.export.page", ALL, "every browser, by a double click", ("max_bytes",), levels=True,
+    ),
 )  # fmt: skip
 """Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another. A row with the suffix ""
 writes a folder, and is taken by name alone."""
@@ -136,10 +139,13 @@ def export_model(
     if surplus := [key for key in given if key not in row.options]:
         takers = [r.name for r in EXPORTS if surplus[0] in r.options]
         raise InputError(f"{_option(surplus[0])} is no option of the format {row.name}, but of {_listed(takers)}")
-    if (level, max_bytes) != (None, None) and not (row.levels and model.kind == "octree"):
+    leveled = row.levels and model.kind == "octree"
+    if not leveled and (level is not None or max_bytes is not None and "max_bytes" not in row.options):
         option, takers = "--max-bytes" if level is None else "--level", [r.name for r in EXPORTS if r.levels]
         raise InputError(f"{option} is for octrees written as {_listed(takers)}, this is {model.kind} as {row.name}")
     part = part_of(model, level, crop)
+    if max_bytes is not None and "max_bytes" in row.options:  # a writer that knows better than whole levels
+        given["max_bytes"], max_bytes = max_bytes, None
     if max_bytes is not None:
         return _fitting(row, part, path, free, max_bytes, given)
     return _write(row, part, path, path, free, given)

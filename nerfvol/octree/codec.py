@@ -30,7 +30,7 @@ COLOUR_STEP = 1.0 / 64.0
 
 _Y00 = 0.28209479177387814
 _LIMIT = 16383  # the zigzag code of a difference of two codes still fits 16 bits
-_TO_GREY = np.array(
+TO_GREY = np.array(
     [[3**-0.5, 3**-0.5, 3**-0.5], [2**-0.5, 0.0, -(2**-0.5)], [6**-0.5, -2 * 6**-0.5, 6**-0.5]], dtype=np.float32
 )
 _PLANES = ("low", "high")
@@ -56,11 +56,11 @@ def encode(density: Float, sh: Float, quality: float = 1.0) -> tuple[dict[str, B
     def channel(index: int) -> tuple[bool, list[bytes]]:
         if index == 0:
             curve = np.arcsinh(density / np.float32(DENSITY_SOFTNESS))
-            codes = _round(curve / np.float32(parameters["density_step"]))
+            codes = round_codes(curve / np.float32(parameters["density_step"]))
         else:
             axis, k = divmod(index - 1, basis_dim)
-            codes = _round(sh[:, :, k] @ (_TO_GREY[axis] / np.float32(parameters["sh_step"])))
-        return _pack(codes)
+            codes = round_codes(sh[:, :, k] @ (TO_GREY[axis] / np.float32(parameters["sh_step"])))
+        return pack_codes(codes)
 
     # zlib and numpy release the interpreter lock; the result does not depend on the number of threads. No more of them
     # than cores: each holds some 30 bytes a vertex.
@@ -95,7 +95,7 @@ def decode(
     compressed = [[read(plane_name(index, plane)) for plane in _PLANES] for index in range(n_channels)]
 
     def channel(index: int) -> None:
-        codes = _unpack(index, compressed[index], n_vertices, bool(differences[index]))
+        codes = unpack_codes(index, compressed[index], n_vertices, bool(differences[index]))
         if index == 0:
             curve = np.clip(codes * np.float32(density_step), -80.0, 80.0)  # sinh stays within float32
             np.multiply(np.sinh(curve, dtype=np.float32), np.float32(softness), out=density)
@@ -105,7 +105,7 @@ def decode(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(channel, range(n_channels)))
     for k in range(basis_dim):  # in place: this is most of the memory that loading takes
-        rotated[k::basis_dim] = (rotated[k::basis_dim].T @ _TO_GREY).T
+        rotated[k::basis_dim] = (rotated[k::basis_dim].T @ TO_GREY).T
     return density, rotated.reshape(3, basis_dim, n_vertices).transpose(2, 0, 1)
 
 
@@ -119,12 +119,13 @@ def plane_names(basis_dim: int) -> list[str]:
     return [plane_name(index, plane) for index in range(1 + 3 * basis_dim) for plane in _PLANES]
 
 
-def _round(values: NDArray[np.floating]) -> NDArray[np.int32]:
+def round_codes(values: NDArray[np.floating]) -> NDArray[np.int32]:
+    """The nearest codes, any shape; what lies beyond their range is clipped."""
     return np.clip(np.rint(values), -_LIMIT, _LIMIT).astype(np.int32)
 
 
-def _pack(codes: NDArray[np.int32]) -> tuple[bool, list[bytes]]:
-    """Whether differences were stored, and the two deflated planes."""
+def pack_codes(codes: NDArray[np.int32]) -> tuple[bool, list[bytes]]:
+    """Of codes (n,): whether differences were stored, and the two deflated planes."""
     stepped = np.diff(codes, prepend=np.int32(0))
     differences = _entropy(stepped) < _entropy(codes)
     signed = stepped if differences else codes
@@ -132,7 +133,8 @@ def _pack(codes: NDArray[np.int32]) -> tuple[bool, list[bytes]]:
     return differences, [_deflate((zigzag & 255).astype(np.uint8)), _deflate((zigzag >> 8).astype(np.uint8))]
 
 
-def _unpack(index: int, planes: list[Bytes], count: int, differences: bool) -> NDArray[np.int32]:
+def unpack_codes(index: int, planes: list[Bytes], count: int, differences: bool) -> NDArray[np.int32]:
+    """The ``count`` codes in a channel's two planes; ValueError where they hold others."""
     low, high = (_inflate(index, plane, count) for plane in planes)
     zigzag = low.astype(np.int32) | (high.astype(np.int32) << 8)
     codes = (zigzag >> 1) ^ -(zigzag & 1)

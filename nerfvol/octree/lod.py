@@ -206,11 +206,20 @@ def simplified(octree: Octree, level: int) -> Octree:
     """
     if level < 1:
         raise InputError(f"an octree is simplified to level 1 or finer, got {level}")
-    apart = at_level(octree, level)
+    return _with_shared_vertices(at_level(octree, level), np.float32(octree.size / 2.0**level))
+
+
+def closed(octree: Octree, nodes: ArrayLike) -> Octree:
+    """:func:`cut` at ``nodes`` (n_nodes,) bool with shared vertices, as :func:`simplified` has them."""
+    return _with_shared_vertices(cut(octree, nodes), np.float32(octree.size / 2.0**octree.max_level))
+
+
+def _with_shared_vertices(apart: Octree, side: np.float32) -> Octree:
+    """``apart`` where every vertex that several cells touch is one; opacities are those of cells of ``side``."""
+    octree = apart
     new = Octree.from_leaves(
         apart.leaf_level, apart.leaf_ijk, octree.origin, octree.size, octree.sh_degree, octree.density_scale
     )
-    side = np.float32(octree.size / 2.0**level)
     thickness = (octree.density_scale * explin(apart.density)).astype(np.float32) * side
     opacity = np.minimum(-np.expm1(-thickness), OPAQUE)
     weighted = apart.values * opacity[:, None]

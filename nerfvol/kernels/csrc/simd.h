@@ -7,6 +7,8 @@
 #include <cstring>
 #if defined(__x86_64__)
 #include <immintrin.h>
+#elif defined(__wasm_simd128__)
+#include <wasm_simd128.h>
 #endif
 
 namespace NERFVOL_ISA {
@@ -87,6 +89,9 @@ inline void keep_in_memory(float (&w)[8]) { __asm__("" : "+m"(w)); }
 #if defined(__SSE2__)
 inline f4 vmin(f4 a, f4 b) { return (f4)_mm_min_ps((__m128)a, (__m128)b); }
 inline f4 vmax(f4 a, f4 b) { return (f4)_mm_max_ps((__m128)a, (__m128)b); }
+#elif defined(__wasm_simd128__)  // pmin(b, a) is a < b ? a : b
+inline f4 vmin(f4 a, f4 b) { return (f4)wasm_f32x4_pmin((v128_t)b, (v128_t)a); }
+inline f4 vmax(f4 a, f4 b) { return (f4)wasm_f32x4_pmax((v128_t)b, (v128_t)a); }
 #else
 inline f4 vmin(f4 a, f4 b) { return a < b ? a : b; }
 inline f4 vmax(f4 a, f4 b) { return a > b ? a : b; }
@@ -122,6 +127,8 @@ inline float least(f8 v) {
 inline uint32_t mask_bits(i4v m) {
 #if defined(__SSE2__)
     return uint32_t(_mm_movemask_ps((__m128)m));
+#elif defined(__wasm_simd128__)
+    return wasm_i32x4_bitmask((v128_t)m);
 #else
     return uint32_t(m[0] & 1) | uint32_t(m[1] & 2) | uint32_t(m[2] & 4) | uint32_t(m[3] & 8);
 #endif

@@ -12,6 +12,8 @@ template <class H> inline Pair<H> select_less(const Pair<H>& x, const Pair<H>& l
 // Square roots, lane by lane.
 #if defined(__SSE2__)
 inline f4 vsqrt(f4 v) { return (f4)_mm_sqrt_ps((__m128)v); }
+#elif defined(__wasm_simd128__)
+inline f4 vsqrt(f4 v) { return (f4)wasm_f32x4_sqrt((v128_t)v); }
 #else
 inline f4 vsqrt(f4 v) { return f4{__builtin_sqrtf(v[0]), __builtin_sqrtf(v[1]), __builtin_sqrtf(v[2]), __builtin_sqrtf(v[3])}; }
 #endif

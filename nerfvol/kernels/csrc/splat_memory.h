@@ -67,7 +67,7 @@ private:
 // parallel_for in that mode, whoever runs the task.
 template <class Task> void splat_for(int64_t n, Task&& task) {
     nerfvol::parallel_for(int(n), [&](int i, int thread) {
-        const FlushDenormals mode;
+        [[maybe_unused]] const FlushDenormals mode;
         task(i, thread);
     });
 }

@@ -4,7 +4,6 @@
 // gives each range its places in each tile's list, so the ranges write in parallel and no list needs sorting. The lists are the
 // same for any number of threads or ranges.
 #pragma once
-#include <mutex>
 #include <utility>
 #include <vector>
 
@@ -52,8 +51,8 @@ inline Frame& shared_frame() {
     static Frame frame;
     return frame;
 }
-inline std::mutex& one_splat_call() {
-    static std::mutex mutex;
+inline nerfvol::Mutex& one_splat_call() {
+    static nerfvol::Mutex mutex;
     return mutex;
 }
 

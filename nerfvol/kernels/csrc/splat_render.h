@@ -86,7 +86,7 @@ void render_basis(const Splats& splats, const SplatView& view, const SplatRender
 }
 
 inline void render_splats(const Splats& splats, const SplatView& view, const SplatRenderOptions& options, const SplatOutput& out) {
-    const std::lock_guard<std::mutex> lock(one_splat_call());
+    const std::lock_guard<nerfvol::Mutex> lock(one_splat_call());
     switch (splats.basis) {
         case 1: return render_basis<1>(splats, view, options, out);
         case 4: return render_basis<4>(splats, view, options, out);

@@ -196,7 +196,7 @@ SplatReport step_basis(const Splats& splats, const SplatView& view, const SplatI
 
 inline SplatReport step_splats(const Splats& splats, const SplatView& view, const SplatImage& image, const SplatLoss& loss,
                                const SplatRates& rates, const SplatMemory& memory) {
-    const std::lock_guard<std::mutex> lock(one_splat_call());
+    const std::lock_guard<nerfvol::Mutex> lock(one_splat_call());
     switch (splats.basis) {
         case 1: return step_basis<1>(splats, view, image, loss, rates, memory);
         case 4: return step_basis<4>(splats, view, image, loss, rates, memory);

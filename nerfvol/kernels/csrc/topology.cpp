@@ -2,6 +2,7 @@
 // nerfvol/octree/topology.py has the same in numpy, used where nothing is compiled.
 #include "topology.h"
 
+#include <algorithm>
 #include <cstddef>
 #include <vector>
 
@@ -55,9 +56,19 @@ int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int m
         const uint64_t h = (key >> 6) * 0x9E3779B97F4A7C15ull;
         return ((h >> 20) * 64 + (key & 63)) & uint64_t(capacity - 1);
     };
+    int32_t of_siblings[27];  // vertices of the lattice that siblings share: they follow each other, and one look-up does for all
     for (int64_t leaf = 0; leaf < n; ++leaf) {
         const int shift = max_level - level[leaf];
+        const int32_t* const at = ijk + 3 * leaf;
+        const bool sibling = leaf && level[leaf] == level[leaf - 1] && !((at[0] ^ at[-3]) >> 1 | (at[1] ^ at[-2]) >> 1 | (at[2] ^ at[-1]) >> 1);
+        if (!sibling) std::fill_n(of_siblings, 27, -1);
+        const int octant = (at[0] & 1) << 2 | (at[1] & 1) << 1 | (at[2] & 1);
         for (int o = 0; o < 8; ++o) {
+            int32_t& known = of_siblings[lattice_place(octant, o)];
+            if (known >= 0) {
+                ids[8 * leaf + o] = known;
+                continue;
+            }
             if (2 * int64_t(keys.size()) >= capacity) {
                 capacity *= 2;
                 table.assign(std::size_t(capacity), -1);
@@ -76,7 +87,7 @@ int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int m
                 table[s] = int32_t(keys.size());
                 keys.push_back(key);
             }
-            ids[8 * leaf + o] = table[s];
+            known = ids[8 * leaf + o] = table[s];
         }
     }
     return int64_t(keys.size());
