@@ -141,3 +141,14 @@ def rotations(quats: ArrayLike) -> NDArray[np.float64]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.moveaxis(np.array(rows), 2, 0)
+
+
+def turning_z_to(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternions (n, 4), w first, of rotations that turn the z axis to unit vectors (n, 3).
+
+    Half the sum of z and the normal is the axis of the half turn; for normals that point down another one serves as well,
+    since a disc has two sides.
+    """
+    n = np.where(normals[:, 2:] < 0, -normals, normals)
+    q = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], axis=1)
+    return q / np.linalg.norm(q, axis=1, keepdims=True)

@@ -156,7 +156,7 @@ def dilated(cells: np.ndarray, holds: np.ndarray) -> np.ndarray:
         x, y, z = (ijk.astype(np.int64) + 1).T
         return (x << 42) + (y << 21) + z
 
-    keys, occupied, kept = key(cells), np.sort(key(cells[holds])), holds.copy()
+    occupied, kept = np.sort(key(cells[holds])), holds.copy()
     for offset in _FACES:
         if not len(occupied):
             break

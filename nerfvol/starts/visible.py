@@ -20,7 +20,7 @@ ENOUGH_VIEWS = 20
 another view alone."""
 JUDGING_VIEWS = 50
 """Views that are asked, evenly chosen: of 100 views of an object the other half changed nothing."""
-_BLOCK = 3  # levels above a leaf: the middle of so large a cell stands for the leaves in it, for pictures change slowly in space
+_BLOCK = 3  # levels above a leaf: the middle of so large a cell stands for its leaves, for pictures change slowly
 
 
 def judged_downscale(dataset: Dataset) -> int:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfvol.cameras.camera import Camera, Intrinsics, orbit
+from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.config.training import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
@@ -242,7 +242,7 @@ def test_hidden_leaves_have_no_weight() -> None:
 
 
 def test_few_views_remove_nothing() -> None:
-    """What nineteen views do not need may be what another needs; twenty can tell, but only of what they have in their picture."""
+    """What nineteen views do not need another may; twenty can tell, but only of what they have in their picture."""
     octree = full_octree(4)
     octree.density = np.full(octree.n_vertices, 3.0)
     few, enough = (views(Blob(), n) for n in (ENOUGH_VIEWS - 1, ENOUGH_VIEWS))
