@@ -50,3 +50,14 @@ def between(source: ArrayLike, target: ArrayLike) -> Float:
         return 2 * np.outer(across, across) - np.eye(3)
     k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + k + k @ k / (1 + cosine)
+
+
+def turning_z_to(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternions (n, 4), w first, of rotations that turn the z axis to unit vectors (n, 3).
+
+    Half the sum of z and the normal is the axis of the half turn; for normals that point down another one serves as well,
+    since a disc has two sides.
+    """
+    n = np.where(normals[:, 2:] < 0, -normals, normals)
+    q = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], axis=1)
+    return q / np.linalg.norm(q, axis=1, keepdims=True)

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from nerfvol.kernels.splat_reference import LOW_PASS, Footprints, Parameters, project
 from nerfvol.kernels.splat_state import SplatView
-from nerfvol.splats.splats import Splats, rotations
+from nerfvol.rotations import rotations
+from nerfvol.splats.splats import Splats
 
 TILE = 16
 REACH = 3.0

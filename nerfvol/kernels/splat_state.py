@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 from nerfvol.native import aligned, aligned_empty, native
+from nerfvol.rotations import rotations
 from nerfvol.splats import packing
 from nerfvol.splats.packing import LANES, PackedSplats
-from nerfvol.splats.splats import Splats, rotations
+from nerfvol.splats.splats import Splats
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nerfvol.errors import InputError
 from nerfvol.octree.points import Y00
+from nerfvol.rotations import turning_z_to
 from nerfvol.splats.neighbours import nearest
 from nerfvol.splats.plyfile import PlyFile
 from nerfvol.splats.splats import Splats
@@ -155,21 +156,10 @@ def splats_of_points(cloud: PointCloud, scale: float = 0.5) -> Splats:
     quats[:, 0] = 1
     if cloud.normals is not None:
         scales[:, 2] *= _FLAT
-        quats = _turning_z_to(cloud.normals.astype(np.float64))
+        quats = turning_z_to(cloud.normals.astype(np.float64))
     origin = 0.5 * (cloud.positions.min(axis=0) + cloud.positions.max(axis=0))
     return Splats(
         means=(cloud.positions - origin).astype(np.float32), log_scales=np.log(scales).astype(np.float32),
         quats=quats.astype(np.float32), logits=np.full(len(cloud), logit(OPAQUE), np.float32),
         sh=dc_of_colour(cloud.colours), origin=origin, mode="mip",
     )  # fmt: skip
-
-
-def _turning_z_to(normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions (n, 4), w first, of rotations that turn the z axis to unit vectors (n, 3).
-
-    Half the sum of z and the normal is the axis of the half turn; for normals that point down another one serves as well,
-    since a disc has two sides.
-    """
-    n = np.where(normals[:, 2:] < 0, -normals, normals)
-    q = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], axis=1)
-    return q / np.linalg.norm(q, axis=1, keepdims=True)

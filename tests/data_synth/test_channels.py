@@ -8,7 +8,19 @@ import pytest
 from scipy import integrate, special
 
 from data_synth import (
-    Camera, DeepShadow, Emission, March, Path, lights, look_at, materials, media, phase, render, sggx, spongecake,
+    Camera,
+    DeepShadow,
+    Emission,
+    March,
+    Path,
+    lights,
+    look_at,
+    materials,
+    media,
+    phase,
+    render,
+    sggx,
+    spongecake,
     surfaces,
 )  # fmt: skip
 from data_synth.scene import Scene

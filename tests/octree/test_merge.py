@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nerfvol.octree.merge import merge_smooth
-from nerfvol.starts.field import write_values
+from nerfvol.octree.merge import _merge_errors, merge_smooth
+from nerfvol.starts.values import write_values
 from tests.fixtures.fields import Blob, full_octree, interpolate, random_points
 
 
@@ -57,3 +57,30 @@ def test_a_step_is_not_merged(what: str) -> None:
     merged = merge_smooth(octree, 2, 1e-3)
     assert merged.n_leaves == 63 + 8 and (merged.leaf_level == 3).sum() == 8
     np.testing.assert_array_equal(merged.leaf_ijk[merged.leaf_level == 3].max(0), [1, 1, 1])
+
+
+def test_the_compiled_error_is_the_one_in_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight leaves with random values; the rounding of 13 numbers, eight products each, is below 1e-5."""
+    octree = full_octree(2)
+    random = np.random.default_rng(0)
+    octree.density = random.uniform(-6, 1.5, octree.n_vertices)
+    octree.sh = random.normal(0, 0.2, octree.sh.shape)
+    first = np.arange(0, 64, 8)
+    fast = _merge_errors(octree, octree.corners, first, octree.size / 4)
+    monkeypatch.setattr("nerfvol.octree.merge.native", lambda: None)
+    slow = _merge_errors(octree, octree.corners, first, octree.size / 4)
+    assert slow.min() > 0.05
+    np.testing.assert_allclose(fast, slow, atol=1e-5)
+
+
+def test_leaves_of_several_sizes_merge_with_their_values() -> None:
+    """Every value that is left stands where it stood, with leaves of three sizes to begin with."""
+    octree = full_octree(3)
+    octree = octree.subdivide(octree.leaf_ijk[:, 0] < 2)[0]
+    write_values(octree, Blob(), 1)
+    merged = merge_smooth(octree, 2, 0.02)
+    merged.validate()
+    assert len(np.unique(merged.leaf_level)) >= 3
+    places = {tuple(p): row for p, row in zip(np.round(octree.vertex_positions(), 6), octree.values, strict=True)}
+    for place, row in zip(np.round(merged.vertex_positions(), 6), merged.values, strict=True):
+        np.testing.assert_array_equal(places[tuple(place)], row)

@@ -7,8 +7,9 @@ from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.errors import InputError
 from nerfvol.kernels import splat_ops
 from nerfvol.kernels.splat_state import SplatState
+from nerfvol.rotations import rotations
 from nerfvol.splats import packing
-from nerfvol.splats.splats import Splats, concatenate, rotations
+from nerfvol.splats.splats import Splats, concatenate
 from tests.splats.scenes import ORIGIN, random_image, random_splats, view_of_cube
 
 FIELDS = ("means", "log_scales", "quats", "logits", "sh")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nerfvol.cameras.camera import Camera, Intrinsics, orbit
+from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.config.training import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
@@ -15,16 +15,10 @@ from nerfvol.field.fields import Domain
 from nerfvol.octree.rows import explin
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
-from nerfvol.starts.field import (
-    Frame,
-    candidate_cells,
-    dilated,
-    distill,
-    judged_downscale,
-    largest_sigma,
-    largest_weights,
-    write_values,
-)
+from nerfvol.starts.cells import Frame, candidate_cells, dilated, largest_sigma
+from nerfvol.starts.field import distill
+from nerfvol.starts.values import write_values
+from nerfvol.starts.visible import ENOUGH_VIEWS, judged_downscale, largest_weights, needed, views_of_leaves
 from tests.fixtures.fields import CENTER, DOMAIN, Blob, full_octree, interpolate, random_points
 
 
@@ -80,7 +74,7 @@ def test_opacity_is_the_closed_form() -> None:
 
 def test_whole_distillation_loses_little() -> None:
     field = Blob()
-    dataset = views(field)
+    dataset = views(field, ENOUGH_VIEWS)
     config = DistillConfig(level=5, coarse_level=3)
     octree, report = distill(
         field, DOMAIN, dataset, (1, 1, 1), config, render_field=lambda camera: field.image(camera, (1, 1, 1))
@@ -180,20 +174,38 @@ def test_nothing_is_left_before_a_lens() -> None:
 
 def test_cells_are_searched_throughout() -> None:
     """A coefficient that rises along x, y or z: the largest of a cell is that of its last sample on that axis."""
-    corners = np.array([[0.0, 1.0, 2.0], [3.0, -1.0, 0.5]])
+    cells, origin = np.array([[0, 2, 5], [7, 1, 0]]), np.array([0.5, -1.0, 2.0])
+    corners = origin + 0.4 * cells
     for axis in range(3):
 
         class Ramp(Blob):
             def density(self, positions: torch.Tensor, axis: int = axis) -> torch.Tensor:
                 return positions[:, axis] + 10
 
-        np.testing.assert_allclose(largest_sigma(Ramp(), corners, 0.4, 4), corners[:, axis] + 10 + 0.35, rtol=1e-6)
+        np.testing.assert_allclose(
+            largest_sigma(Ramp(), cells, origin, 0.4, 4), corners[:, axis] + 10 + 0.35, rtol=1e-6
+        )
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_dilation_is_every_neighbour(monkeypatch, compiled) -> None:
+    """Random cells of a sparse grid, against all pairs."""
+    if not compiled:
+        monkeypatch.setattr("nerfvol.starts.cells.native", lambda: None)
+    random = np.random.default_rng(0)
+    cells = np.unique(random.integers(0, 12, (600, 3)), axis=0)
+    cells = (cells + random.integers(0, 3) * (1 << 18)).astype(np.int32)
+    holds = random.random(len(cells)) < 0.03
+    near = (np.abs(cells[:, None] - cells[None, holds]).max(2) <= 1).any(1)
+    assert 0.2 < near.mean() < 0.9
+    np.testing.assert_array_equal(dilated(cells, holds), near)
+    assert not dilated(cells, np.zeros(len(cells), bool)).any()
 
 
 def test_dilation_is_one_cell() -> None:
     cells = np.array(list(np.ndindex(5, 5, 5)))
     holds = (cells == (2, 2, 2)).all(1) | (cells == (0, 0, 4)).all(1)
-    kept = dilated(cells, holds, 5)
+    kept = dilated(cells, holds)
     near = [(np.abs(cells - np.array(c)).max(1) <= 1) for c in ((2, 2, 2), (0, 0, 4))]
     np.testing.assert_array_equal(kept, near[0] | near[1])
 
@@ -227,6 +239,32 @@ def test_hidden_leaves_have_no_weight() -> None:
     assert weights[ring >= 3].max() < 1e-3
     side = (octree.leaf_ijk[:, 0] == 15) & (np.abs(octree.leaf_ijk[:, 1:] - 7.5).max(1) < 3)
     assert side.sum() > 20 and weights[side].min() > 0.5
+
+
+def test_few_views_remove_nothing() -> None:
+    """What nineteen views do not need another may; twenty can tell, but only of what they have in their picture."""
+    octree = full_octree(4)
+    octree.density = np.full(octree.n_vertices, 3.0)
+    few, enough = (views(Blob(), n) for n in (ENOUGH_VIEWS - 1, ENOUGH_VIEWS))
+    assert needed(octree, few, (1, 1, 1), 0.005).all()
+    hidden = ~needed(octree, enough, (1, 1, 1), 0.005)
+    assert hidden.sum() > 500 and largest_weights(octree, enough, (1, 1, 1), 1)[hidden].max() < 0.005
+    # Half of the pictures, cut at their middle: what only the others have is in the pictures of half of the views.
+    for i in range(0, ENOUGH_VIEWS, 2):
+        lens = enough.cameras[i].intrinsics
+        enough.cameras[i] = dataclasses.replace(
+            enough.cameras[i], intrinsics=lens.cropped(0, 0, lens.width, lens.height // 2)
+        )
+        enough.images[i] = enough.images[i][: lens.height // 2]
+    seen = views_of_leaves(octree, enough)
+    expected = np.zeros(octree.n_leaves, int)
+    blocks = octree.origin + ((octree.leaf_ijk >> 3) + 0.5) * (8 * octree.leaf_sizes()[:, None])
+    for camera in enough.cameras:
+        pixels = camera.project(blocks)
+        expected += ((pixels >= 0) & (pixels < (48, camera.intrinsics.height))).all(1)
+    np.testing.assert_array_equal(seen, expected)
+    assert {ENOUGH_VIEWS, ENOUGH_VIEWS // 2} <= set(seen.tolist())
+    np.testing.assert_array_equal(needed(octree, enough, (1, 1, 1), 0.005)[seen < ENOUGH_VIEWS], True)
 
 
 def test_fields_without_an_sh_head_are_projected() -> None:
@@ -268,11 +306,9 @@ def test_empty_fields_are_an_error() -> None:
     config = DistillConfig(level=4, coarse_level=2)
     with pytest.raises(InputError, match="field is empty.*--init direct"):
         distill(Blob(peak=1e-6), DOMAIN, views(Blob()), (1, 1, 1), config)
-    away = views(Blob())
-    away.cameras = [Camera(c.intrinsics, np.diag([-1.0, 1, -1, 1]) @ np.eye(4)) for c in away.cameras]
     hidden = dataclasses.replace(config, prune_weight=1.1)
     with pytest.raises(InputError, match="training views can see"):
-        distill(Blob(), DOMAIN, away, (1, 1, 1), hidden)
+        distill(Blob(), DOMAIN, views(Blob(), ENOUGH_VIEWS), (1, 1, 1), hidden)
 
 
 @pytest.mark.parametrize("samples", [1, 8])
@@ -281,7 +317,7 @@ def test_values_do_not_depend_on_the_parts(monkeypatch, samples) -> None:
     whole, parts = (full_octree(3).subdivide(np.arange(512) % 3 == 0)[0] for _ in range(2))
     write_values(whole, Blob(), samples)
     monkeypatch.setattr(
-        "nerfvol.starts.field._CHUNK", 100
+        "nerfvol.starts.cells.CHUNK", 100
     )  # of the vertices of two sizes of leaves; the last part is shorter
     write_values(parts, Blob(), samples)
     np.testing.assert_allclose(parts.values, whole.values, rtol=1e-6, atol=1e-6)

@@ -21,7 +21,10 @@ uint64_t spread(uint64_t v) {  // bits of v to every third place
 
 constexpr int kLatticeStride[3] = {9, 3, 1};
 
-// Place of a corner of a new leaf in the 3x3x3 lattice of the old leaf; octant < 0: the leaf is the old one itself.
+bool is_lattice_corner(int place) { return (place / 9) % 2 == 0 && (place / 3) % 3 % 2 == 0 && place % 3 % 2 == 0; }
+
+}  // namespace
+
 int lattice_place(int octant, int corner) {
     int place = 0;
     for (int axis = 0; axis < 3; ++axis) {
@@ -31,7 +34,6 @@ int lattice_place(int octant, int corner) {
     return place;
 }
 
-// Trilinear weights of the lattice's points at the leaf's corners.
 void lattice_weights(float weights[27][8]) {
     for (int p = 0; p < 27; ++p)
         for (int o = 0; o < 8; ++o) {
@@ -41,10 +43,6 @@ void lattice_weights(float weights[27][8]) {
                 weights[p][o] *= 0.5f * float((o >> (2 - axis) & 1) ? at[axis] : 2 - at[axis]);
         }
 }
-
-bool is_lattice_corner(int place) { return (place / 9) % 2 == 0 && (place / 3) % 3 % 2 == 0 && place % 3 % 2 == 0; }
-
-}  // namespace
 
 int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int max_level, int32_t* ids) {
     int64_t capacity = 1024;

@@ -4,6 +4,12 @@
 
 namespace nerfvol {
 
+// Place of a corner of a new leaf in the 3x3x3 lattice of the old leaf; octant < 0: the leaf is the old one itself.
+int lattice_place(int octant, int corner);
+
+// Trilinear weights of the lattice's points at the leaf's corners.
+void lattice_weights(float weights[27][8]);
+
 // Numbers corners in the order in which leaves name them, so that neighbours in space are neighbours in memory.
 // ids (n, 8); the result is the number of vertices.
 int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int max_level, int32_t* ids);

@@ -1,0 +1,168 @@
+"""``nerfvol convert``: an octree from splats, or splats from an octree, and what that costs."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
+from nerfvol.cli.target import Target, open_target
+from nerfvol.config.assemble import run_settings
+from nerfvol.config.values import Colour, Count, seconds, within
+from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfvol.datasets.dataset import Dataset
+    from nerfvol.models import Model
+
+
+@dataclass
+class ConvertOptions:
+    """``nerfvol convert``."""
+
+    target: str = ""
+    to: Literal["octree", "splats"] | None = None
+    out: str = ""
+    data: str | None = None
+    downscale: Count | None = None
+    time_budget: Annotated[float | None, seconds] = None
+    level: Annotated[int, within(3, 14)] | None = None
+    max_splats: Count | None = None
+    background: Colour | None = None
+    storage: Literal["float32", "float16", "compact"] = "compact"
+    seed: int = 0
+    threads: int = 0
+
+
+def arguments(p: argparse.ArgumentParser) -> None:
+    """Adds the command's options to the parser ``p``."""
+    add_target(p)
+    p.add_argument("--to", metavar="octree|splats", help="what it becomes")
+    p.add_argument("--out", metavar="FILE", help="a .safetensors of nerfvol; splats also as .ply or .spz")
+    p.add_argument("--data", metavar="DIR", help="posed images: their cameras decide what is seen and how fine it is, and the "
+                   "result is compared with the model on their held-out views (default: those of the run; without any, "
+                   "cameras all around)")  # fmt: skip
+    p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: that of the run, else 1)")
+    p.add_argument("--time-budget", metavar="TIME", help="train the result on the images for so long, such as 25s "
+                   "(default: not at all)")  # fmt: skip
+    p.add_argument("--level", metavar="L", help="octree: finest leaves, 2^L along the scene (default: 1.4 pixels wide)")
+    p.add_argument("--max-splats", metavar="N", help="splats: at most so many (default: 100000)")
+    p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B (default: that of the training)")
+    p.add_argument(
+        "--storage", metavar="compact|float16|float32", help="octree: how its file holds values (default: compact)"
+    )
+    p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
+
+
+def run(options: ConvertOptions) -> int:
+    """Converts, says what it cost and writes the file; the exit code.
+
+    Raises:
+        InputError: no such model or images, a model that is what is asked for already, or nothing in it that is seen.
+    """
+    need("convert", target=options.target, to=options.to, out=options.out)
+    suffix = Path(options.out).suffix.lower()
+    if suffix not in ((".safetensors", ".ply", ".spz") if options.to == "splats" else (".safetensors",)):
+        ends = ".safetensors, .ply or .spz" if options.to == "splats" else ".safetensors"
+        raise InputError(f"--out {options.out}: expected a file that ends in {ends}, for it becomes an {options.to} file"
+                         .replace("an splats", "a splats"))  # fmt: skip
+    target = open_target(options.target, options.background)
+    if target.model.kind == options.to:
+        raise InputError(
+            f"{target.path} holds {options.to} already; convert makes an octree of splats or splats of an octree"
+        )
+    prepare_outputs(file=options.out)
+    set_threads(options.threads)
+    data, downscale = _images_of(options)
+    if options.time_budget is not None and data is None:
+        raise InputError("--time-budget trains on images: say which with --data DIR")
+    from nerfvol.datasets.load import load_dataset
+
+    training = None if data is None else load_dataset(data, "train", downscale)
+    model = _converted(options, target, training)
+    _write(model, options, suffix)
+    held_out = None if data is None else load_dataset(data, "val", downscale)
+    _say_cost(target, model, held_out)
+    described = model.describe()
+    size = f"{described['leaves']:,} leaves" if options.to == "octree" else f"{described['splats']:,} splats"
+    print(f"{options.out}: {size}, {Path(options.out).stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def _images_of(options: ConvertOptions) -> tuple[str | None, int]:
+    """The folder of images and their factor: as asked, else those of the run where they are still there."""
+    settings = run_settings(options.target)
+    data = options.data
+    if data is None and settings.get("data") and Path(str(settings["data"])).exists():
+        data = str(settings["data"])
+    elif data is not None and not Path(data).exists():
+        raise InputError(f"--data {data}: no such folder or file")
+    return data, options.downscale or int(settings.get("downscale", 1))
+
+
+def _converted(options: ConvertOptions, target: Target, training: Dataset | None) -> Model:
+    from nerfvol.clouds import PointModel
+    from nerfvol.config.training import Config
+    from nerfvol.training import convert
+    from nerfvol.views import OctreeModel, SplatModel
+
+    background, model = target.background, target.model
+    if training is None:
+        scene, cameras = convert.scene_around(model), convert.cameras_around(model)
+    else:
+        scene, cameras = training.scene, convert.small_cameras(training.cameras)
+    config = Config(time_budget=options.time_budget, seed=options.seed)
+    metadata = {k: v for k, v in model.metadata.items() if k in ("orbit", "provenance")} | {
+        "background": list(background)
+    }
+    if options.to == "splats" and not isinstance(model, OctreeModel):
+        raise InputError(f"{target.path} holds {model.kind}, and splats are made of an octree alone")
+    seen = convert.seen_by(model, cameras, scene, background)
+    if isinstance(model, SplatModel | PointModel):
+        octree = convert.octree_of(model.splats, seen, background, options.level, options.seed)
+        if training is not None and options.time_budget is not None:
+            octree = convert.tuned_octree(octree, training, background, config)
+        return OctreeModel(octree, metadata)
+    assert isinstance(model, OctreeModel)
+    splats = convert.splats_of(model.octree, seen, background, options.max_splats or convert.MOST_SPLATS)
+    if training is None or options.time_budget is None:
+        return SplatModel(splats, metadata)
+    tuned = convert.tuned_splats(splats, training, background, config)
+    return SplatModel(tuned.packed, {**metadata, **tuned.metadata})
+
+
+def _write(model: Model, options: ConvertOptions, suffix: str) -> None:
+    """The file; other programs' by the exports, which know them."""
+    if suffix == ".safetensors":
+        model.save(options.out, options.storage)
+        return
+    from nerfvol.export import export_model
+
+    export_model(model, options.out)
+
+
+def _say_cost(target: Target, model: Model, held_out: Dataset | None) -> None:
+    """How much less, or more, the result shows right: on held-out photographs, else against pictures of the model."""
+    from nerfvol.training import convert
+
+    if held_out is not None:
+        before, after = convert.cost(target.model, model, held_out, target.background)
+        print(f"{len(held_out)} held-out views: {target.model.kind} {before:.2f} dB, {model.kind} {after:.2f} dB: "
+              f"{before - after:.2f} dB lost")  # fmt: skip
+        return
+    cameras = convert.cameras_around(target.model)[1::8]
+    pictures = convert.seen_by(target.model, cameras, convert.scene_around(target.model), target.background)
+    after = convert.evaluate(model, pictures, target.background)["psnr"]
+    print(f"against {len(cameras)} pictures of {target.path}: {after:.2f} dB")
+
+
+COMMAND = Command(
+    summary="Make an octree of splats, or splats of an octree.",
+    example="nerfvol convert run --to octree --out octree.safetensors\nnerfvol convert run --to splats --out scene.ply",
+    options=ConvertOptions,
+    arguments=arguments,
+    run=run,
+    place=37,
+)

@@ -1,0 +1,50 @@
+// Python bindings of distilling. Values were checked in Python; sizes are checked here.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <stdexcept>
+
+#include "distil.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+using namespace nerfvol;
+
+namespace {
+
+template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
+template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
+
+void require(bool fits, const char* what) {
+    if (!fits) throw std::invalid_argument(what);
+}
+
+void py_dilate_cells(In<int32_t, nb::shape<-1, 3>> cells, In<uint8_t, nb::ndim<1>> holds, Out<uint8_t, nb::ndim<1>> kept) {
+    require(holds.shape(0) == cells.shape(0) && kept.shape(0) == cells.shape(0), "there must be one entry a cell");
+    nb::gil_scoped_release release;
+    dilate_cells(cells.data(), holds.data(), int64_t(cells.shape(0)), kept.data());
+}
+
+void py_merge_errors(In<float, nb::ndim<2>> values, int density, In<int32_t, nb::ndim<1>> slots, In<float, nb::ndim<1>> bounds,
+                     In<int32_t, nb::shape<-1, 8>> corners, In<int64_t, nb::ndim<1>> first, In<float, nb::ndim<1>> scale,
+                     Out<float, nb::ndim<1>> error) {
+    const int64_t width = int64_t(values.shape(1)), leaves = int64_t(corners.shape(0)), m = int64_t(first.shape(0));
+    require(bounds.shape(0) == slots.shape(0) && int64_t(scale.shape(0)) == m && int64_t(error.shape(0)) == m,
+            "the arrays do not fit one another");
+    require(density >= 0 && density < width, "the density lies outside the rows");
+    for (size_t k = 0; k < slots.shape(0); ++k)
+        require(slots.data()[k] >= 0 && slots.data()[k] < width, "a coefficient lies outside the rows");
+    for (int64_t i = 0; i < m; ++i)
+        require(first.data()[i] >= 0 && first.data()[i] + 8 <= leaves, "a family lies outside the leaves");
+    const VertexRows rows{values.data(), width, density, slots.data(), bounds.data(), int(slots.shape(0))};
+    nb::gil_scoped_release release;
+    merge_errors(rows, corners.data(), first.data(), scale.data(), m, error.data());
+}
+
+}  // namespace
+
+void bind_distilling(nb::module_& m) {
+    m.def("dilate_cells", &py_dilate_cells, "cells"_a, "holds"_a, "kept"_a);
+    m.def("merge_errors", &py_merge_errors, nb::kw_only(), "values"_a, "density"_a, "slots"_a, "bounds"_a, "corners"_a, "first"_a,
+          "scale"_a, "error"_a);
+}

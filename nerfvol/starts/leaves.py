@@ -1,0 +1,192 @@
+"""An octree around Gaussian splats: leaves where Gaussians are, as fine as these are, and what they hold to begin with.
+
+A Gaussian is taken for a density: along its shortest axis it is as thick as its opacity says, -ln(1 - o). That is right for one
+alone and too thick for many that overlap, each of which was trained to cover what the others do; the values are a start that
+is fitted to pictures of the splats afterwards (training/convert.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras.camera import Camera
+from nerfvol.errors import InputError
+from nerfvol.octree.rows import DENSITY_SCALE, DENSITY_SLOT, EMPTY_DENSITY, explin_inverse, sh_slots
+from nerfvol.octree.topology import demorton, morton
+from nerfvol.octree.tree import Octree
+from nerfvol.region import SceneBounds
+from nerfvol.rotations import rotations
+from nerfvol.splats.splats import Splats
+
+FAINTEST = 0.1
+"""Opacity down to which a Gaussian's ellipsoid is filled with leaves; of one that is nowhere so dense its middle alone is."""
+WIDEST = 2.0
+"""... but no farther than so many deviations."""
+PIXELS = 1.4
+"""Side of the finest leaf in pixels of the nearest camera."""
+SCALES = 1.2
+"""... and in units of a Gaussian's middle deviation, where that is larger."""
+SPACING = 0.7
+"""Of a leaf's side: samples of an ellipsoid are so far apart, so that no leaf within it is missed by much."""
+LARGEST_LATTICE = 12
+"""Samples to each side along an axis of a Gaussian, at most: its leaves are coarser where that is not enough."""
+BLUR = 0.35
+"""Of a leaf's side: what a Gaussian's deviations are widened by, in squares, where leaves sample it."""
+_THICKEST = 4.0  # optical thickness of one leaf at the start: beyond, no gradient passes
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Gaussians:
+    """What is asked of n splats: means (n, 3), axes (n, 3, 3) in columns, scales (n, 3), opacity (n,), all float64."""
+
+    means: Float
+    axes: Float
+    scales: Float
+    opacity: Float
+
+    @classmethod
+    def of(cls, splats: Splats) -> _Gaussians:
+        return cls(
+            splats.means + splats.origin, rotations(splats.quats), np.exp(splats.log_scales.astype(np.float64)),
+            1 / (1 + np.exp(-splats.logits.astype(np.float64))),
+        )  # fmt: skip
+
+    def __getitem__(self, chosen: NDArray) -> _Gaussians:
+        return _Gaussians(self.means[chosen], self.axes[chosen], self.scales[chosen], self.opacity[chosen])
+
+    @property
+    def reach(self) -> Float:
+        """(n,) deviations at which the opacity falls to FAINTEST, between 0 and WIDEST."""
+        return np.minimum(np.sqrt(2 * np.log(np.maximum(self.opacity / FAINTEST, 1.0))), WIDEST)
+
+
+def octree_around(
+    splats: Splats, scene: SceneBounds, cameras: Sequence[Camera], level: int, sh_degree: int = 1
+) -> Octree:
+    """The octree of ``splats`` as they stand, in the root cube of ``scene``; what lies outside that is left out.
+
+    Args:
+        cameras: that see the splats: a leaf need not be finer than their pixels. None: as fine as the Gaussians.
+        level: the finest leaves: 2**level along the scene's inner cube, one level less in each shell.
+        sh_degree: of the octree's colours.
+
+    Raises:
+        InputError: no splat lies in the root cube.
+    """
+    size = scene.side * 2.0**scene.n_shells
+    origin = scene.center - size / 2
+    inside = ((splats.means + splats.origin > origin) & (splats.means + splats.origin < origin + size)).all(1)
+    if not inside.any():
+        raise InputError(
+            f"none of the {splats.n} splats lies in the region of the octree, {origin} and {size:.4g} beyond"
+        )
+    gaussians, sh = _Gaussians.of(splats)[inside], splats.with_sh_degree(sh_degree).sh[inside]
+    levels = _levels(gaussians, scene, cameras, level, size)
+    which, leaf_level, codes = _filled(gaussians, levels, origin, size)
+    octree = Octree.from_leaves(*_resolved(leaf_level, codes), origin, size, sh_degree, DENSITY_SCALE / scene.side)
+    _write(octree, gaussians, sh.reshape(len(sh), -1), which, (leaf_level, codes))
+    return octree
+
+
+def _levels(g: _Gaussians, scene: SceneBounds, cameras: Sequence[Camera], level: int, size: float) -> NDArray[np.int64]:
+    """(n,) the level of the leaves that each Gaussian is made of."""
+    side = SCALES * np.sort(g.scales, axis=1)[:, 1]
+    if cameras:
+        pixel = np.full(len(side), np.inf)
+        for camera in cameras:
+            lens = camera.intrinsics
+            np.minimum(pixel, np.linalg.norm(g.means - camera.position, axis=1) / max(lens.fx, lens.fy), out=pixel)
+        side = np.maximum(side, PIXELS * pixel)
+    longest = (2 * g.reach * g.scales.max(1)) / (2 * LARGEST_LATTICE * SPACING)
+    wanted = np.round(np.log2(size / np.maximum(np.maximum(side, longest), 1e-300))).astype(np.int64)
+    return np.clip(wanted, min(3 + scene.n_shells, level), scene.finest_levels(g.means, level))
+
+
+def _filled(
+    g: _Gaussians, levels: NDArray[np.int64], origin: Float, size: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of a Gaussian and a cell that it fills: the Gaussian's number, the cell's level and Morton code, (m,) each."""
+    side = size / 2.0**levels
+    steps = np.ceil(g.reach[:, None] * g.scales / (SPACING * side[:, None])).astype(np.int64)
+    shapes, group = np.unique(steps, axis=0, return_inverse=True)
+    order = np.argsort(group.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(group.reshape(-1), minlength=len(shapes)))
+    numbers, found, codes = [], [], []
+    for shape, members in zip(shapes, np.split(order, ends[:-1]), strict=True):
+        lattice = np.stack(np.meshgrid(*[np.linspace(-1, 1, 2 * n + 1) if n else np.zeros(1) for n in shape],
+                                       indexing="ij"), -1).reshape(-1, 3)  # fmt: skip
+        lattice = lattice[(lattice**2).sum(1) <= 1 + 1e-9] if (shape > 0).any() else lattice
+        if (shape > 0).any() and not len(lattice):
+            lattice = np.zeros((1, 3))
+        for part in np.array_split(members, 1 + len(members) * len(lattice) // 500_000):
+            own = lattice * (g.reach[part, None] * g.scales[part])[:, None]
+            points = g.means[part, None] + own @ g.axes[part].transpose(0, 2, 1)
+            cells = np.floor((points - origin) / side[part, None, None]).astype(np.int64)
+            within = ((cells >= 0) & (cells < (1 << levels[part])[:, None, None])).all(2)
+            keys = morton(np.where(within[..., None], cells, 0).reshape(-1, 3)).reshape(within.shape)
+            keys = np.sort(np.where(within, keys, -1), axis=1)
+            new = keys >= 0
+            new[:, 1:] &= keys[:, 1:] != keys[:, :-1]
+            rows, _ = np.nonzero(new)
+            numbers.append(part[rows])
+            found.append(levels[part[rows]])
+            codes.append(keys[new])
+    return np.concatenate(numbers), np.concatenate(found), np.concatenate(codes)
+
+
+def _resolved(level: NDArray[np.int64], codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Leaves (levels, positions) that cover the same cells, each once: a cell that holds finer ones is split."""
+    coarsest, finest = int(level.min()), int(level.max())
+    own = {k: np.unique(codes[level == k]) for k in range(coarsest, finest + 1)}
+    above = {finest: np.empty(0, np.int64)}
+    for k in range(finest - 1, coarsest - 1, -1):
+        above[k] = np.unique(np.concatenate([own[k + 1], above[k + 1]]) >> 3)
+    levels, leaves, pushed = [], [], np.empty(0, np.int64)
+    for k in range(coarsest, finest + 1):
+        cells = np.unique(np.concatenate([own[k], pushed]))
+        split = np.isin(cells, above[k], assume_unique=True)
+        leaves.append(cells[~split])
+        levels.append(np.full(len(leaves[-1]), k))
+        pushed = (cells[split][:, None] * 8 + np.arange(8)).reshape(-1)
+    return np.concatenate(levels), demorton(np.concatenate(leaves))
+
+
+def _write(
+    octree: Octree,
+    g: _Gaussians,
+    sh: NDArray,
+    which: NDArray[np.int64],
+    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> None:
+    """Density and colour of the leaves, and from them those of the vertices; ``pairs`` (levels, codes) fill the leaves."""
+    levels, codes = pairs
+    side = octree.size / 2.0**levels
+    centers = octree.origin + (demorton(codes) + 0.5) * side[:, None]
+    own = np.einsum("nij,ni->nj", g.axes[which], centers - g.means[which])
+    wide = g.scales[which] ** 2 + (BLUR * side[:, None]) ** 2
+    thickness = -np.log1p(-np.minimum(g.opacity[which], 0.99))
+    sigma = thickness / np.sqrt(2 * np.pi * wide.min(1)) * np.exp(-0.5 * (own**2 / wide).sum(1))
+    leaf = octree.query(centers)
+    # A cell that was split: its density goes to the leaves in it that finer Gaussians fill as well.
+    n = octree.n_leaves
+    held = np.bincount(leaf[leaf >= 0], sigma[leaf >= 0], n)
+    rows = np.stack(
+        [np.bincount(leaf[leaf >= 0], sigma[leaf >= 0] * column[which[leaf >= 0]], n) for column in sh.T], 1
+    )
+    sides = octree.leaf_sizes()
+    share = rows / np.maximum(held, 1e-12)[:, None]
+    held = np.minimum(held, _THICKEST / sides)
+    corner, leaves = octree.corners.reshape(-1), np.repeat(np.arange(n), 8)
+    count = np.bincount(corner, minlength=octree.n_vertices)
+    total = np.bincount(corner, held[leaves], octree.n_vertices)
+    values = np.stack([np.bincount(corner, (held * column)[leaves], octree.n_vertices) for column in share.T], 1)
+    octree.values[:, sh_slots(octree.sh_degree).reshape(-1)] = values / np.maximum(total, 1e-12)[:, None]
+    raw = explin_inverse(np.maximum(total / count / octree.density_scale, 1e-30))
+    octree.values[:, DENSITY_SLOT] = np.maximum(raw, EMPTY_DENSITY)
+    octree.prefiltered = None

@@ -1,0 +1,94 @@
+"""What a distilled octree holds at its vertices: a field's coefficient and spherical harmonics, averaged around each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfvol import sh as spherical
+from nerfvol.field.fields import RadianceField, SHField
+from nerfvol.octree.rows import DENSITY_SLOT, EMPTY_DENSITY, explin_inverse, sh_slots
+from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.tree import Octree
+from nerfvol.starts import cells
+
+THICKEST = 20.0
+"""Optical thickness of a leaf beyond which it is opaque: larger numbers change nothing and are hard to optimise."""
+_FAINT = 1e-6  # coefficient that colour counts with where there is none: empty space has its own colour, not 0 / 0
+
+
+def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int = 8) -> None:
+    """Fill an octree's vertices from a field.
+
+    With 8 samples a vertex is the mean over the middles of the eight cells around it, of half the size of the finest
+    leaf that has the vertex; colour is weighted by the coefficient, so that space in front of a surface has its colour.
+
+    Raises:
+        ValueError: samples_per_vertex is neither 1 nor 8.
+    """
+    if samples_per_vertex not in (1, 8):
+        raise ValueError(f"samples_per_vertex must be 1 or 8, got {samples_per_vertex}")
+    positions, spacing = octree.vertex_positions(), finest_sides(octree)
+    to_sh, slots = sh_of(field, octree.sh_degree), sh_slots(octree.sh_degree).reshape(-1)
+    offsets = (OFFSETS - 0.5) / 2 if samples_per_vertex == 8 else np.zeros((1, 3))
+    some = max(1, cells.CHUNK // len(offsets))
+    values = octree.values
+    for start in range(0, octree.n_vertices, some):
+        part = slice(start, start + some)
+        rows = cells.evaluate(to_sh, positions[part], spacing[part, None, None] * offsets)
+        sigmas = rows[..., 0].astype(np.float64)
+        weights = sigmas + _FAINT
+        weights /= weights.sum(1, keepdims=True)
+        values[part, slots] = (weights[:, None] @ rows[..., 1:])[:, 0]
+        sigma = np.minimum(sigmas.mean(1), THICKEST / spacing[part])
+        raw = explin_inverse(np.maximum(sigma / octree.density_scale, 1e-30))
+        values[part, DENSITY_SLOT] = np.maximum(raw, EMPTY_DENSITY)
+    octree.prefiltered = None
+
+
+def finest_sides(octree: Octree) -> np.ndarray:
+    """(n_vertices,) side of the finest leaf that has the vertex, scene units."""
+    sides = np.empty(octree.n_vertices)
+    for level in np.unique(octree.leaf_level):  # leaves lie in this order: finer ones overwrite
+        sides[octree.corners[octree.leaf_level == level]] = octree.size / 2.0 ** int(level)
+    return sides
+
+
+def sh_of(field: RadianceField, degree: int) -> Callable[[Tensor], Tensor]:
+    """Function from positions (n, 3) to rows (n, 1 + 3 * basis_dim): coefficient, then SH by channel."""
+    dim = spherical.basis_dim(degree)
+    if getattr(field, "has_sh", False):
+        with_head = cast(SHField, field)
+
+        def from_head(points: Tensor) -> Tensor:
+            sigma, sh = with_head.sh(points)
+            if sh.shape[-1] < dim:
+                sh = torch.nn.functional.pad(sh, (0, dim - sh.shape[-1]))
+            return torch.cat([sigma[:, None], sh[..., :dim].flatten(1)], dim=1)
+
+        return from_head
+    dirs, weights = _sphere(degree + 3)
+    projector = (weights[:, None] * spherical.eval_basis(degree, dirs)).float()
+
+    def by_quadrature(points: Tensor) -> Tensor:
+        rows = points.new_zeros(len(points), 3, dim)
+        sigma = points.new_zeros(len(points))
+        for direction, row in zip(dirs.float(), projector, strict=True):
+            sigma, rgb = field(points, direction.expand_as(points))
+            rows += (rgb - 0.5)[..., None] * row
+        return torch.cat([sigma[:, None], rows.flatten(1)], dim=1)
+
+    return by_quadrature
+
+
+def _sphere(n: int) -> tuple[Tensor, Tensor]:
+    """Directions and weights of a product quadrature, exact for polynomials of degree < 2 n."""
+    z, w = np.polynomial.legendre.leggauss(n)
+    z, phi = (a.reshape(-1) for a in np.meshgrid(z, np.pi * np.arange(2 * n) / n, indexing="ij"))
+    s = np.sqrt(1 - z * z)
+    dirs = np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1)
+    return torch.from_numpy(dirs), torch.from_numpy(np.repeat(w, 2 * n) * np.pi / n)

@@ -1,0 +1,181 @@
+"""One representation from another: splats become an octree, an octree splats, and what that cost is measured.
+
+Geometry first (starts/leaves.py, starts/surfels.py), from the model alone. An octree of splats is then fitted to pictures of
+them, since Gaussians that overlap are no sum of densities: no photograph is needed for it. Either may be trained further on
+the photographs themselves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import numpy as np
+
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
+from nerfvol.config.training import Config, OctreeConfig
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
+from nerfvol.measure.scores import evaluate
+from nerfvol.models import Model
+from nerfvol.octree.tree import Octree
+from nerfvol.region import SceneBounds, cube
+from nerfvol.splats.splats import Splats
+from nerfvol.starts.leaves import PIXELS, octree_around
+from nerfvol.starts.subject import subject_of
+from nerfvol.starts.surfels import surfels
+from nerfvol.starts.visible import judged_downscale, largest_weights
+from nerfvol.training.octree_trainer import OctreeTrainer
+from nerfvol.training.phase import Phase
+from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
+from nerfvol.training.splat_trainer import SplatTrainer
+from nerfvol.views import SplatModel
+
+MOST_SPLATS = 100_000
+"""Surfels of an octree where nobody says how many."""
+FITTED_VIEWS = 100
+"""Pictures of the splats that their octree is fitted to, at most."""
+FITTED_STEPS = 400
+"""Steps of the fit: a few seconds on two cores."""
+FITTED_PIXELS = 400
+"""Longer side, at most, of these pictures; of larger cameras a whole fraction."""
+VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
+"""Cameras all around a model whose own are not known, and their angle of view, radians."""
+MOST_LEVEL = 10
+FINE_STEPS = 1500
+"""Steps on photographs where no time is given."""
+
+FIT = {
+    "downscales": [1], "stage_ends": [1.0], "tiles": [320], "prunes": [1], "prune_steps": 20, "foreground_share": 0.9,
+    "colour_weight": 0.02, "distortion": 0.02, "rate_density": 0.3, "rate_dc": 0.07, "rate_sh": 0.006, "rate_decay": 0.1,
+    "decay_from": 0.2, "growing_error": 0.0, "tv_from": 0, "prune_weight": 0.005,
+}  # fmt: skip
+"""Settings of the fit: one stage, and rates that fall from a fifth of it on."""
+TUNE = {"colour_weight": 0.02, "rate_density": 0.15, "rate_dc": 0.05, "decay_from": 0.3}
+"""... and of training on photographs afterwards."""
+
+Say = Callable[[str], object]
+
+
+def cameras_around(model: Model) -> list[Camera]:
+    """VIRTUAL_VIEWS cameras evenly over the sphere around a model's box (Fibonacci's spiral), looking at its middle."""
+    low, high = model.aabb()
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    if not radius > 0:
+        raise InputError("the model has no extent, so no camera can be put around it")
+    focal = FITTED_PIXELS / 2 / math.tan(VIRTUAL_ANGLE / 2)
+    lens = Intrinsics(FITTED_PIXELS, FITTED_PIXELS, focal, focal, FITTED_PIXELS / 2, FITTED_PIXELS / 2)
+    k = np.arange(VIRTUAL_VIEWS) + 0.5
+    z, turn = 1 - 2 * k / VIRTUAL_VIEWS, k * math.pi * (1 + math.sqrt(5))
+    flat = np.sqrt(1 - z * z)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], 1)
+    distance = 1.05 * radius / math.sin(VIRTUAL_ANGLE / 2)
+    return [Camera(lens, look_at(middle + distance * d, middle, (0.0, 0.0, 1.0))) for d in directions]
+
+
+def seen_by(model: Model, cameras: Sequence[Camera], scene: SceneBounds, background: Sequence[float]) -> Dataset:
+    """Pictures of a model as a dataset: what ``cameras`` see of it over ``background``, uint8."""
+    images = []
+    for camera in cameras:
+        picture = model.render(camera, background)["rgb"]
+        images.append(np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8))
+    names = [f"view_{i:03d}" for i in range(len(cameras))]
+    return Dataset(list(cameras), images, names, scene, f"pictures of {model.kind}")
+
+
+def scene_around(model: Model) -> SceneBounds:
+    """The region of a model alone: the smallest cube around its box, with a margin."""
+    low, high = model.aabb()
+    return SceneBounds(cube((low + high) / 2, 0.51 * float((high - low).max())), None, False)
+
+
+def small_cameras(cameras: Sequence[Camera]) -> list[Camera]:
+    """At most FITTED_VIEWS of these, evenly chosen, of about FITTED_PIXELS pixels."""
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), FITTED_VIEWS)).round().astype(int))
+    longest = max(max(c.intrinsics.width, c.intrinsics.height) for c in cameras)
+    factor = max(1, -(-longest // FITTED_PIXELS))
+    return [cameras[i].scaled(factor) if factor > 1 else cameras[i] for i in chosen]
+
+
+def octree_of(
+    splats: Splats, seen: Dataset, background: Sequence[float], level: int | None = None, seed: int = 0
+) -> Octree:
+    """The octree of splats: leaves around them, fitted to ``seen``, pictures of them (:func:`seen_by`).
+
+    level: of the finest leaves, along the scene's inner cube; None: :func:`finest_level`.
+
+    Raises:
+        InputError: no splat lies in the scene's region, or none is seen.
+    """
+    level = finest_level(seen) if level is None else level
+    octree = octree_around(splats, seen.scene, seen.cameras, level)
+    config = OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT)
+    trainer = OctreeTrainer(seen, background, config, seed, octree)
+    for step in range(FITTED_STEPS):
+        trainer.step(step / FITTED_STEPS)
+    return trainer.octree
+
+
+def splats_of(octree: Octree, seen: Dataset, background: Sequence[float], most: int | None = None) -> Splats:
+    """The surfels of what ``seen``'s cameras see of an octree.
+
+    Raises:
+        InputError: they see none of it.
+    """
+    return surfels(octree, largest_weights(octree, seen, background, judged_downscale(seen)), most)
+
+
+def tuned_octree(
+    octree: Octree, dataset: Dataset, background: Sequence[float], config: Config, say: Say = print
+) -> Octree:
+    """An octree trained further on photographs, for ``config.time_budget`` seconds or FINE_STEPS steps."""
+    settings = dataclasses.replace(config.octree, steps=FINE_STEPS, **TUNE)
+    trainer = OctreeTrainer(dataset, background, settings, config.seed, octree)
+    _run(trainer, config.time_budget, FINE_STEPS, say)
+    return trainer.finish()
+
+
+def tuned_splats(
+    splats: Splats, dataset: Dataset, background: Sequence[float], config: Config, say: Say = print
+) -> SplatModel:
+    """Splats trained further on photographs, for ``config.time_budget`` seconds or FINE_STEPS steps."""
+    photographs = Photographs(dataset, background)
+    sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
+    seconds = config.time_budget or FINE_STEPS * SECONDS_PER_STEP
+    schedule = make_schedule(seconds, sizes, dataset.scene.is_unbounded, config.splats.max_splats)
+    schedule = dataclasses.replace(schedule, most=max(schedule.most, splats.n))
+    settings = config.splats.for_scene(dataset.scene)
+    splats = splats.with_sh_degree(settings.sh_degree or 0)
+    distance = subject_of(dataset).distance
+    trainer = SplatTrainer(photographs, splats, settings, schedule, distance, background, config.seed)
+    _run(trainer, config.time_budget, FINE_STEPS, say)
+    return trainer.take_model({})
+
+
+def _run(phase: Phase, seconds: float | None, steps: int, say: Say) -> None:
+    """A phase's steps, by the clock or counted."""
+    started, done, progress = time.perf_counter(), 0, 0.0
+    while progress < 1:
+        phase.step(progress)
+        done += 1
+        progress = done / steps if seconds is None else (time.perf_counter() - started) / seconds
+    say(f"trained {done} steps on the photographs: {phase.size()}")
+
+
+def cost(a: Model, b: Model, views: Dataset, background: Sequence[float]) -> tuple[float, float]:
+    """PSNR of both models on ``views``, dB."""
+    first, second = (evaluate(model, views, background)["psnr"] for model in (a, b))
+    return cast(float, first), cast(float, second)
+
+
+def finest_level(dataset: Dataset) -> int:
+    """Level whose leaves are about PIXELS wide at the scene's middle for the nearest camera, at most MOST_LEVEL."""
+    center, side = dataset.scene.center, dataset.scene.side
+    pixel = min(
+        float(np.linalg.norm(c.position - center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in dataset.cameras
+    )
+    return int(np.clip(round(math.log2(side / (PIXELS * pixel))), 5, MOST_LEVEL))
