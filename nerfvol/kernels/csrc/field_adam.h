@@ -1,0 +1,48 @@
+// Adam on what a step has touched: numbers whose gradient is zero stay as they are, moments included [Mueller et al. 2022].
+#pragma once
+#include <cmath>
+
+#include "field.h"
+#include "simd.h"
+
+namespace NERFVOL_ISA {
+
+struct AdamStep {
+    float rate, beta1, beta2, eps, decay, scale2;  // scale2: 1 / (1 - beta2^n); the other correction is in the rate
+
+    AdamStep(const nerfvol::FieldRates& r, float with_decay, int64_t n)
+        : rate(float(double(r.rate) / (1.0 - std::pow(double(r.beta1), double(n))))), beta1(r.beta1), beta2(r.beta2), eps(r.eps), decay(with_decay),
+          scale2(float(1.0 / (1.0 - std::pow(double(r.beta2), double(n))))) {}
+};
+
+// One line of up to sixteen numbers; of exactly so many the loop becomes vectors.
+template <bool Whole> inline void adam_line(float* p, float* m, float* v, float* d, int count, const AdamStep& a) {
+    for (int k = 0; k < (Whole ? 16 : count); ++k) {
+        const float g = d[k] + a.decay * p[k];
+        const float m1 = a.beta1 * m[k] + (1.0f - a.beta1) * g, v1 = a.beta2 * v[k] + (1.0f - a.beta2) * g * g;
+        const float moved = p[k] - a.rate * m1 / (std::sqrt(v1 * a.scale2) + a.eps);
+        const bool touched = d[k] != 0.0f;
+        p[k] = touched ? moved : p[k];
+        m[k] = touched ? m1 : m[k];
+        v[k] = touched ? v1 : v[k];
+        d[k] = 0.0f;
+    }
+}
+
+// Moves n numbers and zeroes their gradients; the decay is added to the gradient [L2 in Adam, not AdamW].
+inline void adam(float* value, float* first, float* second, float* gradient, int64_t n, const AdamStep& a) {
+    for (int64_t i = 0; i < n; i += 16) {
+        const int count = int(n - i < 16 ? n - i : 16);
+        uint32_t any = 0;
+        for (int k = 0; k < count; ++k) {
+            uint32_t bits;
+            std::memcpy(&bits, gradient + i + k, 4);
+            any |= bits << 1;  // -0 is zero too
+        }
+        if (!any) continue;
+        if (count == 16) adam_line<true>(value + i, first + i, second + i, gradient + i, count, a);
+        else adam_line<false>(value + i, first + i, second + i, gradient + i, count, a);
+    }
+}
+
+}  // namespace NERFVOL_ISA
