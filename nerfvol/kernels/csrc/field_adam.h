@@ -1,5 +1,6 @@
 // Adam on what a step has touched: numbers whose gradient is zero stay as they are, moments included [Mueller et al. 2022].
 #pragma once
+#include <algorithm>
 #include <cmath>
 
 #include "field.h"
@@ -30,18 +31,27 @@ template <bool Whole> inline void adam_line(float* p, float* m, float* v, float*
 }
 
 // Moves n numbers and zeroes their gradients; the decay is added to the gradient [L2 in Adam, not AdamW].
+//
+// Few lines of a level have a gradient: those of 64 are found first and all that they need is asked for, then they are moved.
 inline void adam(float* value, float* first, float* second, float* gradient, int64_t n, const AdamStep& a) {
-    for (int64_t i = 0; i < n; i += 16) {
-        const int count = int(n - i < 16 ? n - i : 16);
-        uint32_t any = 0;
-        for (int k = 0; k < count; ++k) {
-            uint32_t bits;
-            std::memcpy(&bits, gradient + i + k, 4);
-            any |= bits << 1;  // -0 is zero too
+    for (int64_t from = 0; from < n; from += 64 * 16) {
+        const int64_t to = std::min(n, from + 64 * 16);
+        uint64_t touched = 0;
+        for (int64_t i = from; i < to; i += 16) {
+            uint32_t any = 0, bits[16] = {};
+            std::memcpy(bits, gradient + i, sizeof(float) * std::size_t(std::min<int64_t>(16, to - i)));
+            for (uint32_t b : bits) any |= b << 1;  // -0 is zero too
+            if (!any) continue;
+            touched |= uint64_t(1) << (i - from) / 16;
+            __builtin_prefetch(value + i, 1);
+            __builtin_prefetch(first + i, 1);
+            __builtin_prefetch(second + i, 1);
         }
-        if (!any) continue;
-        if (count == 16) adam_line<true>(value + i, first + i, second + i, gradient + i, count, a);
-        else adam_line<false>(value + i, first + i, second + i, gradient + i, count, a);
+        for (; touched; touched &= touched - 1) {
+            const int64_t i = from + 16 * __builtin_ctzll(touched);
+            if (to - i >= 16) adam_line<true>(value + i, first + i, second + i, gradient + i, 16, a);
+            else adam_line<false>(value + i, first + i, second + i, gradient + i, int(to - i), a);
+        }
     }
 }
 

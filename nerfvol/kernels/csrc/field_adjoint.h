@@ -16,8 +16,8 @@ inline void distortion_totals(const Chunk& c, const ChunkRay& a, float unit, flo
     for (int g = a.segment; g >= 0; g = c.segments[std::size_t(g)].before) {
         const Segment& segment = c.segments[std::size_t(g)];
         for (int s = segment.start; s < segment.start + segment.count; ++s) {
-            mass += c.weight[std::size_t(s)];
-            moment += c.weight[std::size_t(s)] * c.middle[std::size_t(s)] * unit;
+            mass += c.weight[s];
+            moment += c.weight[s] * c.middle[s] * unit;
         }
     }
 }
@@ -86,7 +86,8 @@ inline ChunkLoss adjoint(const Chunk& c, const FieldRays& rays, int64_t from, co
     return sum;
 }
 
-// The network again, block by block, and backwards; `encoding` gets the gradient of each packet's encoding (rows, 16), or null.
+// The network again, block by block, and backwards; `encoding` gets the gradient of the encoding, packets of
+// (features, 16) for each level, or null.
 inline void network_adjoint(Chunk& c, const SampleGradients& d, float* sums, float* encoding) {
     const FieldShape& f = c.f;
     Layers& layers = c.layers;
@@ -107,14 +108,18 @@ inline void network_adjoint(Chunk& c, const SampleGradients& d, float* sums, flo
             } else {
                 float* rgb = layers.output_gradient(f.n_layers - 1) + p * layers.stride(f.n_layers);
                 for (int channel = 0; channel < 3; ++channel) {
-                    const f16 v = load<f16>(c.colour.data() + 3 * at + channel * kLanes);
+                    const f16 v = load<f16>(c.colour + 3 * at + channel * kLanes);
                     store(rgb + channel * kLanes, load<f16>(colour + channel * kLanes) * v * (1.0f - v));
                 }
             }
         }
-        const float* e = c.encoded.data() + s / kLanes * es;
+        const float* e = c.encoded + s / kLanes * es;
         layers.back(e, packets, sums, d.raw.data() + s);
-        if (encoding) std::memcpy(encoding + s / kLanes * es, layers.g[0].data(), std::size_t(packets * es) * sizeof(float));
+        const std::size_t row = std::size_t(f.features * kLanes);
+        for (int p = 0; p < packets && encoding; ++p)
+            for (int level = 0; level < f.levels; ++level)
+                std::memcpy(encoding + (std::size_t(level) * std::size_t(c.samples / kLanes) + std::size_t(s / kLanes + p)) * row,
+                            layers.g[0].data() + p * es + int64_t(level) * int64_t(row), row * sizeof(float));
     }
 }
 

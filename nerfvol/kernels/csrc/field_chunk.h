@@ -1,6 +1,7 @@
 // A chunk of rays through the field: they march in waves of a few samples a ray, so that little is evaluated behind what is
 // opaque, and each wave goes through encoding, network and compositing before the next begins.
 #pragma once
+#include "arena.h"
 #include "field_layers.h"
 #include "field_march.h"
 #include "sh_basis.h"
@@ -49,11 +50,12 @@ public:
     ChunkRay rays[kRays];
     std::vector<Segment> segments;
     // Packets: encoding (rows, 16), position (3, 16), colour (3, 16); else one number a sample.
-    Floats encoded, position, colour, tau, slope, weight, behind, middle, length;
-    std::vector<int32_t> ray;
+    float *encoded = nullptr, *position = nullptr, *colour = nullptr;
+    float *tau = nullptr, *slope = nullptr, *weight = nullptr, *behind = nullptr, *middle = nullptr, *length = nullptr;
+    int32_t* ray = nullptr;
 
-    Chunk(const Network& net, const FieldParameters& given, const Marcher& marcher, bool training)
-        : f(net.f), layers(net, training), table_(given.table), marcher_(marcher), bits_(std::size_t(marcher.words()) * kRays) {
+    Chunk(const Network& net, const FieldParameters& given, const Marcher& marcher, nerfvol::Arena& arena, bool training)
+        : f(net.f), layers(net, training), table_(given.table), marcher_(marcher), arena_(arena), bits_(std::size_t(marcher.words()) * kRays) {
         basis_.resize(std::size_t(kRays * std::max(16, f.encoded_dir)));
         directions_.resize(std::size_t(kBlockPackets * kLanes * std::max(16, f.encoded_dir)));
     }
@@ -84,7 +86,7 @@ public:
     // The basis functions of the directions of a packet's rays, rows of sixteen; for an rgb head their encoding.
     void directions(int first, int rows, float* out) const {
         for (int k = 0; k < kLanes; ++k) {
-            const float* from = basis_.data() + std::size_t(ray[std::size_t(first + k)] * rows);
+            const float* from = basis_.data() + std::size_t(ray[first + k] * rows);
             for (int i = 0; i < rows; ++i) out[i * kLanes + k] = from[i];
         }
     }
@@ -93,8 +95,11 @@ public:
 private:
     const float* table_;
     const Marcher& marcher_;
+    nerfvol::Arena& arena_;
     std::vector<uint64_t> bits_;
-    Floats basis_, directions_, opacity_, passed_;
+    Floats basis_, directions_;
+    float *opacity_ = nullptr, *passed_ = nullptr;
+    int room_ = 0;
 
     void begin(const FieldRays& given, int64_t from, int count) {
         n = count;
@@ -127,25 +132,34 @@ private:
         for (int i = 0; i < f.encoded_dir; ++i) out[i] = rows[std::size_t(i * kLanes)];
     }
 
+    // Room for so many samples, in the arena, which keeps its memory from call to call.
     void reserve(int wanted) {
-        if (int(tau.size()) >= wanted) return;
-        const std::size_t size = std::size_t(padded(wanted + wanted / 2, 4096));
-        encoded.resize(size * std::size_t(encoded_rows(f)));
-        position.resize(3 * size);
-        colour.resize(3 * size);
-        for (auto* a : {&tau, &slope, &weight, &behind, &middle, &length, &opacity_, &passed_}) a->resize(size);
-        ray.resize(size);
+        if (room_ >= wanted) return;
+        const int before = room_;
+        room_ = int(padded(wanted + wanted / 2, 4096));
+        const auto grow = [&](float*& a, int rows) {
+            float* larger = static_cast<float*>(arena_.take(std::size_t(rows) * std::size_t(room_) * sizeof(float)));
+            if (before) std::memcpy(larger, a, std::size_t(rows) * std::size_t(before) * sizeof(float));
+            a = larger;
+        };
+        grow(encoded, encoded_rows(f));
+        grow(position, 3);
+        grow(colour, 3);
+        for (float** a : {&tau, &slope, &weight, &behind, &middle, &length, &opacity_, &passed_}) grow(*a, 1);
+        int32_t* rays_of = static_cast<int32_t*>(arena_.take(std::size_t(room_) * sizeof(int32_t)));
+        if (before) std::memcpy(rays_of, ray, std::size_t(before) * sizeof(int32_t));
+        ray = rays_of;
     }
 
     void put(int r, float t, float delta) {
         const int s = samples++;
         const ChunkRay& a = rays[r];
-        float* p = position.data() + std::size_t(s / kLanes * 3 * kLanes + s % kLanes);
+        float* p = position + std::size_t(s / kLanes * 3 * kLanes + s % kLanes);
         for (int axis = 0; axis < 3; ++axis) p[axis * kLanes] = a.o[axis] + a.d[axis] * t;
-        middle[std::size_t(s)] = t;
-        length[std::size_t(s)] = delta;
-        ray[std::size_t(s)] = r;
-        weight[std::size_t(s)] = 0;
+        middle[s] = t;
+        length[s] = delta;
+        ray[s] = r;
+        weight[s] = 0;
     }
 
     // The next samples of a ray, one wave's; false where there are none.
@@ -168,15 +182,15 @@ private:
     // Pairs of packets are evaluated: the rest is filled with copies of the last sample, of no length and no weight.
     void fill_up() {
         const int last = samples - 1;
-        while (samples % (2 * kLanes)) put(ray[std::size_t(last)], middle[std::size_t(last)], 0.0f);
+        while (samples % (2 * kLanes)) put(ray[last], middle[last], 0.0f);
     }
 
     void evaluate(int base) {
         const int64_t es = int64_t(encoded_rows(f)) * kLanes;
         for (int p = base / kLanes; p < samples / kLanes; ++p) {
-            float* x = position.data() + p * 3 * kLanes;
+            float* x = position + p * 3 * kLanes;
             to_encoding(f, x);
-            encode(f, table_, x, encoded.data() + p * es);
+            encode(f, table_, x, encoded + p * es);
         }
         for (int s = base; s < samples; s += nerfvol::kFieldBlock) {
             const int packets = std::min(kBlockPackets, (samples - s) / kLanes);
@@ -190,7 +204,7 @@ public:
     void run_block(int s, int packets) {
         const int rows = direction_rows();
         for (int p = 0; p < packets; ++p) directions(s + p * kLanes, rows, directions_.data() + p * rows * kLanes);
-        layers.run(encoded.data() + int64_t(s / kLanes) * encoded_rows(f) * kLanes, directions_.data(), packets, f.n_layers - 1, 0);
+        layers.run(encoded + int64_t(s / kLanes) * encoded_rows(f) * kLanes, directions_.data(), packets, f.n_layers - 1, 0);
     }
     const float* block_directions(int p) const { return directions_.data() + p * direction_rows() * kLanes; }
 
@@ -198,13 +212,13 @@ private:
     void heads(int s, int p) {
         const float* raw = layers.output(f.head) + p * layers.stride(f.head + 1);
         f16 t, d;
-        activate(f, load<f16>(raw), load<f16>(length.data() + s) * f.density_scale, t, d);
-        store(tau.data() + s, t);
-        store(slope.data() + s, d);
+        activate(f, load<f16>(raw), load<f16>(length + s) * f.density_scale, t, d);
+        store(tau + s, t);
+        store(slope + s, d);
         const f16 e = vexp(splat16(0.0f) - t);
-        store(passed_.data() + s, e);
-        store(opacity_.data() + s, one_minus_exp(t, e));
-        float* out = colour.data() + 3 * s;
+        store(passed_ + s, e);
+        store(opacity_ + s, one_minus_exp(t, e));
+        float* out = colour + 3 * s;
         if (!f.sh_head) {
             const float* rgb = layers.output(f.n_layers - 1) + p * layers.stride(f.n_layers);
             for (int c = 0; c < 3; ++c) store(out + c * kLanes, sigmoid(load<f16>(rgb + c * kLanes)));
@@ -223,13 +237,13 @@ private:
     bool composite(ChunkRay& a, Segment& segment, float eps) {
         for (int i = 0; i < segment.count; ++i) {
             const int s = segment.start + i;
-            const float* c = colour.data() + s / kLanes * 3 * kLanes + s % kLanes;
-            const float w = a.trans * opacity_[std::size_t(s)];
+            const float* c = colour + s / kLanes * 3 * kLanes + s % kLanes;
+            const float w = a.trans * opacity_[s];
             for (int k = 0; k < 3; ++k) a.colour[k] += w * c[k * kLanes];
-            a.depth += w * middle[std::size_t(s)];
-            a.trans *= passed_[std::size_t(s)];
-            weight[std::size_t(s)] = w;
-            behind[std::size_t(s)] = a.trans;
+            a.depth += w * middle[s];
+            a.trans *= passed_[s];
+            weight[s] = w;
+            behind[s] = a.trans;
             ++used;
             if (a.trans < eps) {
                 segment.count = i + 1;

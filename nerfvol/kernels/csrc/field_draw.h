@@ -10,10 +10,11 @@ inline void render_field(const FieldShape& f, const FieldParameters& given, cons
                          const nerfvol::FieldOutput& out) {
     const Network net(f, given.network, false);
     const Marcher marcher(f, march);
+    nerfvol::Arenas arenas;
     std::vector<std::unique_ptr<Chunk>> of_thread(std::size_t(nerfvol::get_threads()));
     nerfvol::parallel_for(int((rays.n + kRays - 1) / kRays), [&](int task, int thread) {
         auto& chunk = of_thread[std::size_t(thread)];
-        if (!chunk) chunk = std::make_unique<Chunk>(net, given, marcher, false);
+        if (!chunk) chunk = std::make_unique<Chunk>(net, given, marcher, arenas.of_thread(thread), false);
         const int64_t from = int64_t(task) * kRays;
         chunk->forward(rays, from, int(std::min<int64_t>(kRays, rays.n - from)), loss.early_stop_eps);
         for (int r = 0; r < chunk->n; ++r) {

@@ -60,8 +60,15 @@ inline void encode_frequencies(int n, const float* p, float* out) {
 inline void encode(const FieldShape& f, const float* table, const float* p, float* out) {
     if (!f.hashed) return encode_frequencies(f.frequencies, p, out);
     with_features(f.features, [&](auto features) {
-        for (int level = 0; level < f.levels; ++level)
-            interpolate<features>(f, table, level, p, out + level * features * kLanes);
+        Corners corners[2];  // the next level's are found, and asked for, before this one's are read
+        find_corners(f, 0, p, corners[0]);
+        for (int level = 0; level < f.levels; ++level) {
+            if (level + 1 < f.levels) {
+                find_corners(f, level + 1, p, corners[(level + 1) % 2]);
+                prefetch<features>(corners[(level + 1) % 2], table + f.start[level + 1] * features);
+            }
+            interpolate<features>(corners[level % 2], table + f.start[level] * features, out + level * features * kLanes);
+        }
     });
 }
 

@@ -64,11 +64,14 @@ inline void find_corners(const FieldShape& f, int level, const float* p, Corners
 
 typedef float f2 __attribute__((vector_size(8)));
 
-// Rows level * F .. level * F + F - 1 of a packet's encoding.
-template <int F> inline void interpolate(const FieldShape& f, const float* table, int level, const float* p, float* out) {
-    Corners c;
-    find_corners(f, level, p, c);
-    const float* entries = table + f.start[level] * F;
+// Asks for the cache lines of all corners: neighbours in z share one mostly.
+template <int F> inline void prefetch(const Corners& c, const float* entries) {
+    for (int r = 0; r < 8; r += 2)
+        for (int k = 0; k < kLanes; ++k) __builtin_prefetch(entries + F * int64_t(c.entry[r][k]), 1);
+}
+
+// F rows of a packet's encoding from a level's entries.
+template <int F> inline void interpolate(const Corners& c, const float* entries, float* out) {
     for (int k = 0; k < kLanes; ++k) {
         if constexpr (F == 2) {
             f4 sum{};
@@ -91,11 +94,7 @@ template <int F> inline void interpolate(const FieldShape& f, const float* table
 
 // Adds a packet's gradient d (its rows of this level) to the entries of [from, from + count), in the order of samples: whoever
 // has another range of the level adds the rest, and each entry's sum is the same.
-template <int F>
-inline void scatter(const FieldShape& f, int level, const float* p, const float* d, float* gradient, int64_t from, int64_t count) {
-    Corners c;
-    find_corners(f, level, p, c);
-    const bool whole = count == f.start[level + 1] - f.start[level];
+template <int F> inline void scatter(const Corners& c, const float* d, float* gradient, bool whole, int64_t from, int64_t count) {
     for (int k = 0; k < kLanes; ++k) {
         if constexpr (F == 2) {
             const float a = d[k], b = d[kLanes + k];

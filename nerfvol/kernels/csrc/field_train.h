@@ -15,7 +15,7 @@ namespace NERFVOL_ISA {
 using nerfvol::FieldReport;
 constexpr int kGroups = nerfvol::kFieldGroups;
 
-// What a chunk of rays leaves to the second pass.
+// What a chunk of rays leaves to the second pass: packets of positions, and of gradients, level by level.
 struct Left { const float *position, *gradient; int packets; };
 
 struct Range { int64_t from, to; int chunk; };
@@ -35,17 +35,32 @@ inline std::vector<Range> ranges_of(int64_t n) {
 inline Left leave(const Chunk& c, nerfvol::Arena& arena, float* gradient) {
     const std::size_t bytes = std::size_t(3 * c.samples) * sizeof(float);
     float* position = static_cast<float*>(arena.take(bytes));
-    std::memcpy(position, c.position.data(), bytes);
+    std::memcpy(position, c.position, bytes);
     return {position, gradient, c.samples / kLanes};
 }
 
 // A level, or the entries [from, to) of it, through all chunks.
 inline void scatter_level(const FieldShape& f, int level, int64_t from, int64_t to, const std::vector<Left>& chunks, float* gradient) {
-    const int64_t es = int64_t(encoded_rows(f)) * kLanes;
+    const bool whole = from == 0 && to == f.start[level + 1] - f.start[level];
     with_features(f.features, [&](auto features) {
+        constexpr int kRow = features * kLanes;
+        Corners corners[2];  // the next packet's are found, and asked for, before this one's are written
+        const float* waiting = nullptr;
+        int turn = 0;
         for (const Left& c : chunks)
-            for (int p = 0; p < c.packets; ++p)
-                scatter<features>(f, level, c.position + p * 3 * kLanes, c.gradient + p * es + level * features * kLanes, gradient, from, to - from);
+            for (int p = 0; p < c.packets; ++p) {
+                const float* d = c.gradient + (int64_t(level) * c.packets + p) * kRow;
+                uint32_t any = 0, bits[kRow];
+                std::memcpy(bits, d, sizeof(bits));
+                for (uint32_t b : bits) any |= b << 1;
+                if (!any) continue;
+                find_corners(f, level, c.position + p * 3 * kLanes, corners[turn]);
+                prefetch<features>(corners[turn], gradient);
+                turn ^= 1;
+                if (waiting) scatter<features>(corners[turn], waiting, gradient, whole, from, to - from);
+                waiting = d;
+            }
+        if (waiting) scatter<features>(corners[turn ^ 1], waiting, gradient, whole, from, to - from);
     });
 }
 
@@ -75,7 +90,7 @@ struct FieldStep {
         std::vector<std::unique_ptr<Chunk>> of_thread(std::size_t(nerfvol::get_threads()));
         nerfvol::parallel_for(kGroups, [&](int g, int thread) {
             auto& chunk = of_thread[std::size_t(thread)];
-            if (!chunk) chunk = std::make_unique<Chunk>(net, FieldParameters{memory.table, memory.network}, marcher, true);
+            if (!chunk) chunk = std::make_unique<Chunk>(net, FieldParameters{memory.table, memory.network}, marcher, arenas.of_thread(thread), true);
             nerfvol::Arena& arena = arenas.of_thread(thread);
             float* sums = static_cast<float*>(arena.take(std::size_t(floats) * sizeof(float)));
             std::memset(sums, 0, std::size_t(floats) * sizeof(float));
@@ -110,7 +125,7 @@ private:
         counts_[2 * number] = chunk.samples;
         counts_[2 * number + 1] = chunk.used;
         float* encoding = nullptr;
-        if (f.hashed) encoding = static_cast<float*>(arena.take(std::size_t(chunk.samples) * std::size_t(encoded_rows(f)) * sizeof(float)));
+        if (f.hashed) encoding = static_cast<float*>(arena.take(std::size_t(chunk.samples) * std::size_t(f.encoded) * sizeof(float)));
         network_adjoint(chunk, gradients, sums, encoding);
         left_[number] = f.hashed ? leave(chunk, arena, encoding) : Left{nullptr, nullptr, 0};
     }
