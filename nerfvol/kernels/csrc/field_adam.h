@@ -16,6 +16,16 @@ struct AdamStep {
           scale2(float(1.0 / (1.0 - std::pow(double(r.beta2), double(n))))) {}
 };
 
+inline bool has_gradient(const float* d, int count) {
+    uint32_t any = 0;
+    for (int k = 0; k < count; ++k) {
+        uint32_t bits;
+        std::memcpy(&bits, d + k, 4);
+        any |= bits << 1;  // -0 is zero too
+    }
+    return any;
+}
+
 // One line of up to sixteen numbers; of exactly so many the loop becomes vectors.
 template <bool Whole> inline void adam_line(float* p, float* m, float* v, float* d, int count, const AdamStep& a) {
     for (int k = 0; k < (Whole ? 16 : count); ++k) {
@@ -38,10 +48,7 @@ inline void adam(float* value, float* first, float* second, float* gradient, int
         const int64_t to = std::min(n, from + 64 * 16);
         uint64_t touched = 0;
         for (int64_t i = from; i < to; i += 16) {
-            uint32_t any = 0, bits[16] = {};
-            std::memcpy(bits, gradient + i, sizeof(float) * std::size_t(std::min<int64_t>(16, to - i)));
-            for (uint32_t b : bits) any |= b << 1;  // -0 is zero too
-            if (!any) continue;
+            if (to - i >= 16 ? !has_gradient(gradient + i, 16) : !has_gradient(gradient + i, int(to - i))) continue;
             touched |= uint64_t(1) << (i - from) / 16;
             __builtin_prefetch(value + i, 1);
             __builtin_prefetch(first + i, 1);
