@@ -6,6 +6,7 @@ arrays of one are those of the other.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -135,7 +136,8 @@ def layers_of(shape: FieldShape) -> list[Layer]:
     return [*layers, Layer(shape.width, 1 + shape.width, False, 0), colours, Layer(hidden, 3, False, 0)]
 
 
-def step_edges(domain: Domain, n_steps: int) -> tuple[list[float], float]:
+@functools.lru_cache(maxsize=32)
+def step_edges(domain: Domain, n_steps: int) -> tuple[tuple[float, ...], float]:
     """Edges of the marching steps, as distances from where a ray enters the domain, and the length of the first.
 
     Steps are equal in a bounded scene (``n_steps`` along its diagonal); with a background they grow with the distance.
@@ -147,4 +149,4 @@ def step_edges(domain: Domain, n_steps: int) -> tuple[list[float], float]:
     while t < reach + step or (len(edges) - 1) % GROUP:  # whole groups, beyond the longest ray
         t += max(step, growth * t)
         edges.append(t)
-    return edges, step
+    return tuple(edges), step

@@ -144,8 +144,8 @@ def _step(
     table, network = (
         [state.array(name + part) for part in ("", "_first", "_second", "_gradient")] for name in ("table", "network")
     )
-    shape = state.kernel_shape()
-    r = compiled.field_step(shape, *rays, march.kernel(), terms, adam, table, network, state.updates, moves)
+    shape = state.kernel_shape
+    r = compiled.field_step(shape, *rays, march.kernel, terms, adam, table, network, state.updates, moves)
     return FieldStepReport(r.loss, r.squared_error, r.samples, r.used)
 
 
@@ -171,8 +171,8 @@ def render_rays(
     assert compiled is not None
     out = {k: np.empty((len(o), 3) if k == "rgb" else len(o), np.float32) for k in OUTPUTS if k in outputs}
     arrays = (state.array("table"), state.array("network"))
-    shape = state.kernel_shape()
-    compiled.field_render(shape, *arrays, o, d, march.kernel(), terms, *(out.get(name) for name in OUTPUTS))
+    shape = state.kernel_shape
+    compiled.field_render(shape, *arrays, o, d, march.kernel, terms, *(out.get(name) for name in OUTPUTS))
     return out
 
 
@@ -199,8 +199,8 @@ def evaluate(
     sigma = np.empty(len(x), np.float32)
     rows = np.empty((len(x), count), np.float32) if values else None
     arrays = (state.array("table"), state.array("network"))
-    cells = None if where is None else where.kernel()
-    compiled.field_evaluate(state.kernel_shape(), *arrays, x, dirs, cells, sigma, rows)
+    cells = None if where is None else where.kernel
+    compiled.field_evaluate(state.kernel_shape, *arrays, x, dirs, cells, sigma, rows)
     return sigma, rows if rows is None or not with_sh else rows.reshape(len(x), 3, -1)
 
 
@@ -211,5 +211,5 @@ def march_rays(state: FieldState, batch: FieldBatch, march: March) -> NDArray[np
     assert compiled is not None
     steps = len(march.edges) - 1
     bits = np.empty((len(o), -(-steps // 64)), np.uint64)
-    compiled.field_march(state.kernel_shape(), o, d, jitter, march.kernel(), bits)
+    compiled.field_march(state.kernel_shape, o, d, jitter, march.kernel, bits)
     return np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")[:, :steps].astype(bool)

@@ -7,6 +7,7 @@ The kernels work on it; field_ops.py checks it. The arrays are those of ``nerfvo
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -132,6 +133,7 @@ class FieldState:
         """Of the values alone."""
         return self.table.nbytes + self.network.nbytes
 
+    @functools.cached_property
     def kernel_shape(self) -> Any:
         """The same as the kernels' class."""
         compiled, shape, domain = native(), self.shape, self.domain
@@ -230,8 +232,9 @@ class March:
         """(n + 1,) distances from where a ray enters, u."""
         return np.array(step_edges(self.occupancy.domain, self.n_steps)[0], np.float32)
 
+    @functools.cached_property
     def kernel(self) -> Any:
-        """The same as the kernels' class."""
+        """The same as the kernels' class, which reads the occupancy's own bits."""
         compiled, where, domain = native(), self.occupancy, self.occupancy.domain
         assert compiled is not None
         edges, step = step_edges(domain, self.n_steps)
@@ -247,4 +250,4 @@ class March:
 
     def with_steps(self, n_steps: int) -> March:
         """The same with other steps."""
-        return dataclasses.replace(self, n_steps=n_steps)
+        return self if n_steps == self.n_steps else dataclasses.replace(self, n_steps=n_steps)

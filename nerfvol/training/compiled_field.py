@@ -42,9 +42,14 @@ WARM_UP = 20
 
 
 def _key(seed: int, step: int) -> int:
-    """64 bits that depend on both alone."""
-    words = np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)
-    return int(words[0])
+    """64 bits that depend on both alone, mixed as in field.sampling.step_generator."""
+    key = 0
+    for word in (seed, step):
+        key = (key + word * 0xD1342543DE82EF95 + 0x9E3779B97F4A7C15) % 2**64
+        key = (key ^ key >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+        key = (key ^ key >> 27) * 0x94D049BB133111EB % 2**64
+        key ^= key >> 31
+    return key
 
 
 class Pixels:

@@ -1,5 +1,6 @@
 // Batches of a field's training, and the bits of its occupied cells. Memory bound: one build for all instruction sets.
 #include <algorithm>
+#include <cstring>
 #include <vector>
 
 #include "field.h"
@@ -28,12 +29,28 @@ void dilate(std::vector<uint8_t>& cells, int n, int stride) {
     cells.swap(out);
 }
 
+// A bit for each cell from bit `at` on.
 void pack(const std::vector<uint8_t>& cells, int64_t at, uint64_t* bits) {
-    for (std::size_t i = 0; i < cells.size(); ++i) {
-        const int64_t place = at + int64_t(i);
-        if (place % 64 == 0 || i == 0) bits[place / 64] &= place % 64 ? (uint64_t(1) << place % 64) - 1 : 0;
-        bits[place / 64] |= uint64_t(cells[i] & 1) << place % 64;
+    const int64_t n = int64_t(cells.size());
+    if (at % 64 || n % 64) {  // few cells
+        for (int64_t i = 0; i < n; ++i) {
+            uint64_t& word = bits[(at + i) / 64];
+            const uint64_t bit = uint64_t(1) << (at + i) % 64;
+            word = cells[std::size_t(i)] ? word | bit : word & ~bit;
+        }
+        return;
     }
+    parallel_for(int((n / 64 + 255) / 256), [&](int task, int) {
+        for (int64_t w = int64_t(task) * 256; w < std::min<int64_t>(n / 64, int64_t(task + 1) * 256); ++w) {
+            uint64_t word = 0;
+            for (int64_t k = 0; k < 8; ++k) {
+                uint64_t eight;
+                std::memcpy(&eight, cells.data() + 64 * w + 8 * k, 8);
+                word |= (eight * 0x0102040810204080ull >> 56) << 8 * k;  // eight bytes of 0 or 1 become eight bits
+            }
+            bits[at / 64 + w] = word;
+        }
+    });
 }
 
 }  // namespace
@@ -78,16 +95,18 @@ void refresh_occupancy(const float* sigmas, int cubes, int resolution, const flo
                 }
         });
         pack(cells, int64_t(cube) * r * r * r, occupied);
-        for (int x = 0; x < c; ++x)
+        parallel_for(c, [&](int x, int) {
             for (int y = 0; y < c; ++y)
                 for (int z = 0; z < c; ++z) {
-                    uint8_t any = 0;
+                    uint32_t any = 0;
                     for (int i = 0; i < 16; ++i) {
-                        const uint8_t* row = &cells[(std::size_t(4 * x + i / 4) * r + std::size_t(4 * y + i % 4)) * r + std::size_t(4 * z)];
-                        any |= row[0] | row[1] | row[2] | row[3];
+                        uint32_t four;
+                        std::memcpy(&four, &cells[(std::size_t(4 * x + i / 4) * r + std::size_t(4 * y + i % 4)) * r + std::size_t(4 * z)], 4);
+                        any |= four;
                     }
-                    pooled[(std::size_t(x) * c + y) * c + z] = any;
+                    pooled[(std::size_t(x) * c + y) * c + z] = any != 0;
                 }
+        });
         for (int stride : {1, c, c * c}) dilate(pooled, c, stride);
         pack(pooled, int64_t(cube) * c * c * c, coarse);
         before = cells;
