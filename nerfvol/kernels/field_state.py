@@ -95,8 +95,11 @@ class FieldState:
         rng = np.random.Generator(np.random.Philox(seed))
         self.table = aligned_empty((self.levels.starts[-1] if self.levels else 0, shape.hash_features), np.float32)
         self.table[...] = rng.uniform(-1e-4, 1e-4, self.table.shape)
-        bounds = [np.full(layer.numbers, 1 / math.sqrt(layer.inputs)) for layer in self.layers]
-        self.network = aligned((rng.uniform(-1, 1, sum(map(len, bounds))) * np.concatenate(bounds)), np.float32)
+        numbers = []
+        for layer in self.layers:  # biases begin at zero [He et al. 2015]
+            numbers += [rng.uniform(-1, 1, layer.outputs * layer.inputs) * math.sqrt(6 / layer.inputs)]
+            numbers += [np.zeros(layer.outputs)]
+        self.network = aligned(np.concatenate(numbers), np.float32)
         for name in ("table", "network"):
             for part in ("_first", "_second", "_gradient"):
                 zeros = aligned_empty(getattr(self, name).shape, np.float32)

@@ -126,7 +126,7 @@ FieldReport py_step(const FieldShape& f, Vectors o, Vectors d, std::optional<In<
     require(table.size() == 4 && network.size() == 4, "values, two moments and a gradient are wanted");
     for (int k = 0; k < 4; ++k) {
         require(int64_t(table[std::size_t(k)].shape(0)) >= entries(f) && int64_t(network[std::size_t(k)].shape(0)) >= f.n_network, "the arrays do not fit the field");
-        require(reinterpret_cast<uintptr_t>(table[std::size_t(k)].data()) % 64 == 0, "the grid's arrays must begin on a cache line");
+        require(!f.hashed || reinterpret_cast<uintptr_t>(table[std::size_t(k)].data()) % 64 == 0, "the grid's arrays must begin on a cache line");
     }
     require(int64_t(updates.shape(0)) >= f.levels + 1 && (!moves || int64_t(moves->shape(0)) >= f.levels), "a count is wanted for each level and the network");
     const FieldRays rays = make_rays(o, d, jitter, target);
