@@ -106,17 +106,17 @@ class FieldConfig(Checked):
 
     shape: FieldShape = dataclasses.field(default_factory=FieldShape)
     """Section: the network."""
-    steps: Count = 1500
+    steps: Count = 4000
     """Length of the schedule (images, learning rate) where nobody says how far the run has come."""
-    time_budget: Annotated[float, above(0)] = 75.0
+    time_budget: Annotated[float, above(0)] = 15.0
     """Seconds of wall clock the field gets when it only prepares the octree."""
-    downscales: tuple[Downscale, ...] = (8, 4, 2)
+    downscales: tuple[Downscale, ...] = (1,)
     """Images are area-averaged by these factors, one a stage, coarse ones first."""
-    stage_ends: tuple[Share, ...] = (0.08, 0.35, 1.0)
+    stage_ends: tuple[Share, ...] = (1.0,)
     """Share of progress at which each stage ends."""
-    samples_per_step: Count = 16384
+    samples_per_step: Count = 8192
     """Samples of one step: the number of rays follows from how many samples a ray has just now."""
-    march_steps: tuple[Annotated[int, at_least(8)], ...] = (96, 192, 384)
+    march_steps: tuple[Annotated[int, at_least(8)], ...] = (384,)
     """Marching steps along the diagonal of the inner cube, one a stage."""
     sampler: Literal["occupancy", "importance"] = "occupancy"
     """Skip empty space, or stratified coarse samples and inverse-CDF fine samples as the paper does."""
@@ -124,24 +124,42 @@ class FieldConfig(Checked):
     """Stratified samples of a ray with the importance sampler."""
     n_fine: Count = 128
     """Inverse-CDF samples of a ray with the importance sampler."""
-    grid_resolution: Annotated[int, at_least(8)] = 64
+    grid_resolution: Annotated[int, within(8, 512)] = 128
     """Cells along an edge of the occupancy grid, a multiple of 4."""
     rate: Annotated[float, above(0, 1e3)] = 0.01
     """Adam's learning rate at the start."""
     rate_decay: Decay = 0.05
     """The rate shrinks exponentially to this factor at the end, from a third of the run on."""
-    colour_weight: Weight = 0.0
-    """Weight of the loss of each sample's own colour, (sum w |c - target|^2 + T |background - target|^2)."""
+    colour_weight: Weight = 0.05
+    """Weight of the loss of each sample's own colour, (sum w |c - target|^2 + T |background - target|^2), at the start; it
+    shrinks exponentially to a tenth."""
+    distortion_weight: Weight = 0.0
+    """Weight of the distortion loss of Mip-NeRF 360 at the start, distances in edges of the inner cube; it shrinks alike."""
+    entropy_weight: Weight = 0.0
+    """Weight of the entropy of a ray's opacity."""
+    table_decay: Weight = 1e-6
+    """Times an entry of the hash grid, added to its gradient where it has one: what few rays saw falls back to what coarser
+    levels say ..."""
+    few_views: Annotated[int, at_least(0)] = 16
+    """... and with so many training pictures or fewer that is what matters most: then it is ..."""
+    few_decay: Weight = 1e-4
+    """... this, and colours do not depend on the direction."""
     sparsity_weight: Weight = 0.0
-    """Weight of mean(1 - exp(-sigma * step)) at random points: clears space that nothing constrains."""
+    """Weight of mean(1 - exp(-sigma * step)) at random points: clears space that nothing constrains. Trains in torch."""
     bfloat16: bool = True
-    """Network arithmetic in bfloat16 while training (2 to 3 times as fast where the processor has it)."""
+    """Where the field trains in torch: network arithmetic in bfloat16 (2 to 3 times as fast where the processor has it)."""
+    trainer: Literal["auto", "torch"] = "auto"
+    """By the compiled kernels where they can hold the network (auto), or always in torch, some ten times slower."""
 
     def check(self) -> None:
         same_length(self, "downscales", "stage_ends", "march_steps")
         increasing_to_one(self, "stage_ends")
         if self.grid_resolution % 4:
             raise InputError(f"field.grid_resolution must be a multiple of 4, got {self.grid_resolution}")
+
+    def stage_at(self, progress: float) -> int:
+        """The stage at ``progress`` in [0, 1], from 0."""
+        return next((stage for stage, end in enumerate(self.stage_ends) if progress < end), len(self.stage_ends) - 1)
 
 
 @dataclass

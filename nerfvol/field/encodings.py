@@ -3,12 +3,13 @@
 Positions are in the unit ball of the encoding: [-1, 1]**3 for ``FrequencyEncoding``, [0, 1]**3 for ``HashGrid``.
 """
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from nerfvol.field.layout import BRICK, BRICK_ENTRIES, GridLevels
 
 # Spatial hash of Teschner et al. 2003, as used by Mueller et al. 2022.
 _PRIMES = (1, 2654435761 - (1 << 32), 805459861)  # as signed 32-bit numbers
@@ -66,7 +67,8 @@ class HashGrid(nn.Module):
     """Multiresolution grid of trilinearly interpolated features (Mueller et al. 2022).
 
     Level l has resolution N_l = floor(n_min * b**l), b = exp(ln(n_max / n_min) / (n_levels - 1)), and its vertices are
-    stored densely where (N_l + 1)**3 fits into 2**log2_table entries; finer levels share the entries through a hash.
+    stored densely where (N_l + 1)**3 fits into 2**log2_table entries; finer levels share the entries through a hash of bricks of
+    2 x 2 x 4 vertices (``layout.GridLevels``).
 
     Args:
         n_levels: number of levels (at least 1).
@@ -79,18 +81,12 @@ class HashGrid(nn.Module):
         self, n_levels: int = 8, n_features: int = 2, log2_table: int = 17, n_min: int = 16, n_max: int = 256
     ) -> None:
         super().__init__()
-        if n_levels < 1 or n_max < n_min or n_min < 1:
-            raise ValueError(f"need n_levels >= 1 and 1 <= n_min <= n_max, got {n_levels}, {n_min}, {n_max}")
-        growth = math.log(n_max / n_min) / max(n_levels - 1, 1)
-        # The tiny relative excess keeps an exact n_max from being rounded down to n_max - 1.
-        self.resolutions = [int(n_min * math.exp(growth * level) * (1 + 1e-9)) for level in range(n_levels)]
-        self.hash_size = 1 << log2_table
-        self.n_dense = sum((n + 1) ** 3 <= self.hash_size for n in self.resolutions)
+        self.levels = GridLevels.of(n_levels, log2_table, n_min, n_max)
+        self.resolutions, self.starts = list(self.levels.resolutions), list(self.levels.starts[:-1])
+        self.n_dense = self.levels.n_dense
         self.n_features = n_features
         self.out_dim = n_levels * n_features
-        sizes = [min((n + 1) ** 3, self.hash_size) for n in self.resolutions]
-        self.starts = [sum(sizes[:level]) for level in range(n_levels)]
-        self.table = nn.Parameter(torch.empty(sum(sizes), n_features).uniform_(-1e-4, 1e-4))
+        self.table = nn.Parameter(torch.empty(self.levels.starts[-1], n_features).uniform_(-1e-4, 1e-4))
 
     def corners(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Table entries (int32) and trilinear weights of the 8 vertices around each point in each level.
@@ -127,10 +123,16 @@ class HashGrid(nn.Module):
 
     def _hash_indices(self, cells: list[Tensor], out: Tensor) -> None:
         # int32 arithmetic wraps like the 32-bit hash does; the mask keeps the low bits, so the sign does not matter.
-        mixed = [(cell * prime, (cell + 1) * prime) for cell, prime in zip(cells, _PRIMES, strict=True)]
+        hashed, inside = [], []
+        for cell, prime, side, stride in zip(cells, _PRIMES, BRICK, (8, 4, 1), strict=True):
+            both = (cell, cell + 1)
+            hashed.append([v // side * prime for v in both])
+            inside.append([v % side * stride for v in both])
         for o in range(8):
-            torch.bitwise_xor(mixed[0][o >> 2], mixed[1][o >> 1 & 1], out=out[o])
-            out[o].bitwise_xor_(mixed[2][o & 1]).bitwise_and_(self.hash_size - 1)
+            x, y, z = o >> 2, o >> 1 & 1, o & 1
+            torch.bitwise_xor(hashed[0][x], hashed[1][y], out=out[o])
+            out[o].bitwise_xor_(hashed[2][z]).bitwise_and_(self.levels.bricks - 1).mul_(BRICK_ENTRIES)
+            out[o].add_(inside[0][x]).add_(inside[1][y]).add_(inside[2][z])
 
     def forward(self, p: Tensor) -> Tensor:
         """(n, 3) in [0, 1]**3 (outside is clamped) -> (n, n_levels * n_features), coarse level first."""

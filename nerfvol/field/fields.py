@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -19,6 +18,7 @@ from torch.nn import functional
 from nerfvol import sh as spherical
 from nerfvol.config.training import FieldShape
 from nerfvol.field.encodings import FrequencyEncoding, HashGrid
+from nerfvol.field.layout import Domain
 
 
 @runtime_checkable
@@ -43,42 +43,6 @@ class SHField(RadianceField, Protocol):
     def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """(n, 3) -> sigma (n,), sh (n, 3, (sh_degree + 1)**2)."""
         ...
-
-
-@dataclass(frozen=True)
-class Domain:
-    """The region a field covers: an inner cube and, around it, as much contracted background as ``outer`` asks for.
-
-    center (3,), half: the inner cube is center +- half, in scene units.
-    outer: half edge of the whole region in units of ``half``; 1 = there is nothing outside the inner cube.
-    """
-
-    center: tuple[float, float, float]
-    half: float
-    outer: float = 1.0
-
-    @property
-    def aabb(self) -> Tensor:
-        """(2, 3) float32: the whole region."""
-        center = torch.tensor(self.center)
-        return torch.stack([center - self.half * self.outer, center + self.half * self.outer])
-
-    def scaled(self, positions: Tensor) -> Tensor:
-        """Scene positions (..., 3) in units of the inner cube, which becomes [-1, 1]**3."""
-        return (positions - positions.new_tensor(self.center)) / self.half
-
-    def contract(self, positions: Tensor) -> Tensor:
-        """Scene positions (..., 3) to [-1, 1]**3, each axis alone: linear in the inner cube, x -> 2 - 1/x outside.
-
-        The contraction of Reiser (2023); with ``outer`` = 1 it is a plain scaling. Positions outside the whole region land
-        on its faces.
-        """
-        x = self.scaled(positions)
-        if self.outer <= 1:
-            return x.clamp(-1, 1)
-        size = x.abs()
-        bent = torch.where(size <= 1, x, x.sign() * (2 - 1 / size.clamp(min=1)))
-        return (bent / (2 - 1 / self.outer)).clamp(-1, 1)
 
 
 ROWS = 2048

@@ -5,7 +5,6 @@ with the same number of cells (Mueller et al. 2022); a bounded scene has one. A 
 the field was seen to have in it, decaying at each visit. Samples leave ``march`` packed: one row a kept segment.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,10 +13,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from nerfvol.errors import InputError
-from nerfvol.field.fields import Domain, NeuralField
+from nerfvol.field.fields import NeuralField
+from nerfvol.field.layout import GROUP, Domain, step_edges
 from nerfvol.field.sampling import intersect_aabb
 
-_GROUP = 8  # steps tested at once against the coarse grid
 _POOL = 4  # cells of the grid along an edge of a cell of the coarse grid
 
 
@@ -41,15 +40,8 @@ class StepSchedule:
     """
 
     def __init__(self, domain: Domain, n_steps: int) -> None:
-        step = 2 * math.sqrt(3) * domain.half / n_steps
-        reach = 2 * math.sqrt(3) * domain.half * max(domain.outer, 1.0)
-        edges, t = [0.0], 0.0
-        growth = 0.0 if domain.outer <= 1 else 4.0 / n_steps
-        while t < reach + step or (len(edges) - 1) % _GROUP:  # whole groups, beyond the longest ray
-            t += max(step, growth * t)
-            edges.append(t)
+        edges, self.step_size = step_edges(domain, n_steps)
         self.edges = torch.tensor(edges, dtype=torch.float32)
-        self.step_size = step
 
 
 class OccupancyGrid:
@@ -66,7 +58,7 @@ class OccupancyGrid:
         if resolution % _POOL:
             raise ValueError(f"resolution must be a multiple of {_POOL}, got {resolution}")
         self.domain, self.resolution, self.threshold, self.decay = domain, resolution, threshold, decay
-        self.n_cubes = 1 + max(0, math.ceil(math.log2(domain.outer) - 1e-6))
+        self.n_cubes = domain.cubes
         edge = 2 * domain.half / resolution
         self.cell_edges = edge * 2.0 ** torch.arange(self.n_cubes)
         # Start above the threshold everywhere: a cell has to be seen empty several times before it is skipped.
@@ -170,7 +162,7 @@ class OccupancyGrid:
         origin, direction = self.domain.scaled(rays_o), rays_d / self.domain.half
         edges = schedule.edges
         rays, groups = self._coarse_hits(origin, direction, start, far, edges)
-        steps = (groups * _GROUP)[:, None] + torch.arange(_GROUP)
+        steps = (groups * GROUP)[:, None] + torch.arange(GROUP)
         t_starts, t_ends = start[rays, None] + edges[steps], start[rays, None] + edges[steps + 1]
         middle = (t_starts + t_ends) / 2
         o, d = origin[rays], direction[rays]
@@ -184,7 +176,7 @@ class OccupancyGrid:
         self, origin: Tensor, direction: Tensor, start: Tensor, far: Tensor, edges: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Ray and group of each group of steps that may meet an occupied cell, in order."""
-        lower, upper = edges[:-1:_GROUP], edges[_GROUP::_GROUP]
+        lower, upper = edges[:-1:GROUP], edges[GROUP::GROUP]
         middle = start[:, None] + (lower + upper) / 2
         x, y, z = (torch.addcmul(origin[:, i, None], direction[:, i, None], middle) for i in range(3))
         cube = None

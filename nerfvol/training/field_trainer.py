@@ -17,11 +17,14 @@ from torch import Tensor
 
 from nerfvol.config.training import FieldConfig
 from nerfvol.errors import InputError
-from nerfvol.field.fields import Domain, NeuralField, RadianceField, make_field
+from nerfvol.field.fields import NeuralField, RadianceField, make_field
+from nerfvol.field.layout import Domain
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
+from nerfvol.kernels import field_ops
 from nerfvol.kernels.state import StepReport
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
+from nerfvol.training.compiled_field import CompiledFieldTrainer
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
@@ -53,6 +56,22 @@ FIELD_SHARE = 0.3
 """Of the time left in a run, the most that the field gets."""
 SECONDS_TO_DISTILL = 2.0
 """Kept for the end of a run while a field is trained: what an octree takes to be written."""
+
+
+def make_field_trainer(
+    dataset: Dataset, config: FieldConfig, seed: int = 0, background: Sequence[float] = (1.0, 1.0, 1.0)
+) -> FieldTrainer | CompiledFieldTrainer:
+    """The trainer of a field: by the compiled kernels where they can, else in torch; arguments as of both."""
+    refused = field_ops.refusal(config.shape) is not None or config.sampler != "occupancy" or config.sparsity_weight > 0
+    if refused or config.trainer == "torch":
+        return FieldTrainer(dataset, config, seed, background)
+    domain = domain_of(dataset.scene)
+    return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain))
+
+
+def near_plane_of(domain: Domain) -> float:
+    """How near to a camera a field is looked at, u: cameras stand in the scene where it has a background."""
+    return NEAREST * domain.half if domain.outer > 1 else 0.0
 
 
 class PixelBank:
@@ -262,7 +281,7 @@ class FieldTrainer:
 
         Jittered with a generator, the middles without.
         """
-        near_plane = NEAREST * self.domain.half if self.domain.outer > 1 else 0.0
+        near_plane = near_plane_of(self.domain)
         if self.config.sampler == "importance":
             near, far = intersect_aabb(rays_o, rays_d, self.domain.aabb)
             near = near.clamp(min=near_plane)
@@ -293,7 +312,7 @@ class FieldTrainer:
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         generator = step_generator(self.seed, self.steps_done)
         self._set_rate(progress)
-        stage = self._stage_at(progress)
+        stage = config.stage_at(progress)
         bank, self.schedule = self._bank(stage), self.schedules[stage]
         rays_o, rays_d, target = bank.sample(self.n_rays, generator)
         samples = self.find_samples(rays_o, rays_d, generator)
@@ -349,10 +368,6 @@ class FieldTrainer:
             per_ray = float(self._importance_samples)
         wanted = self.config.samples_per_step / max(per_ray, 1.0)
         self.n_rays = max(1, min(MOST_RAYS, int(min(wanted, 1.25 * self.n_rays + 16))))
-
-    def _stage_at(self, progress: float) -> int:
-        ends = self.config.stage_ends
-        return next((stage for stage, end in enumerate(ends) if progress < end), len(ends) - 1)
 
     def _bank(self, stage: int) -> PixelBank:
         downscale = self.config.downscales[stage]

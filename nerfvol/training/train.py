@@ -200,11 +200,11 @@ def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
 def start_from_field(run: Run) -> Octree:
     """Trains the field and distils it; the octree, and the scores of both among the run's results."""
     from nerfvol.starts.field import distill
-    from nerfvol.training.field_trainer import FieldTrainer
+    from nerfvol.training.field_trainer import make_field_trainer
 
     config, background, data = run.config, run.background, run.data
     ops.set_threads(ops.get_threads())  # torch was loaded only now
-    field = FieldTrainer(data.training, config.field, config.seed, background)
+    field = make_field_trainer(data.training, config.field, config.seed, background)
     optimise(run, field)
     run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
                             "MB": field.parameter_bytes / 1e6}  # fmt: skip

@@ -16,6 +16,7 @@
 #include "arena.h"
 #include "batch.h"
 #include "pool.h"
+#include "field_bindings.h"
 #include "splat_bindings.h"
 #include "topology.h"
 #include "tree.h"
@@ -326,6 +327,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("restrict_cells", &py_restrict_cells, "mask"_a, "first"_a, "corners"_a, "rows"_a, "weight"_a, "density"_a, "sums"_a);
     m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "row"_a, "out"_a, "target"_a);
     bind_splats(m);
+    bind_fields(m);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
     m.def("isa", [] { return std::string(isa_name()); });

@@ -1,4 +1,4 @@
-// Chooses among the builds of kernels.cpp and splat_kernels.cpp at run time.
+// Chooses among the builds of kernels.cpp, splat_kernels.cpp and field_kernels.cpp at run time.
 #include <cstring>
 
 #include "tree.h"
@@ -6,36 +6,39 @@
 namespace baseline {
 extern const nerfvol::Kernels table;
 extern const nerfvol::SplatKernels splat_table;
+extern const nerfvol::FieldKernels field_table;
 }
 #ifdef NERFVOL_HAVE_avx2
 namespace avx2 {
 extern const nerfvol::Kernels table;
 extern const nerfvol::SplatKernels splat_table;
+extern const nerfvol::FieldKernels field_table;
 }
 #endif
 #ifdef NERFVOL_HAVE_avx512
 namespace avx512 {
 extern const nerfvol::Kernels table;
 extern const nerfvol::SplatKernels splat_table;
+extern const nerfvol::FieldKernels field_table;
 }
 #endif
 
 namespace nerfvol {
 namespace {
-struct Choice { const char* name; const Kernels* table; const SplatKernels* splats; };
+struct Choice { const char* name; const Kernels* table; const SplatKernels* splats; const FieldKernels* fields; };
 
 int choices(Choice* out) {
     int n = 0;
 #ifdef NERFVOL_HAVE_avx512
     if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
         __builtin_cpu_supports("avx512bw"))
-        out[n++] = {"avx512", &avx512::table, &avx512::splat_table};
+        out[n++] = {"avx512", &avx512::table, &avx512::splat_table, &avx512::field_table};
 #endif
 #ifdef NERFVOL_HAVE_avx2
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
-        out[n++] = {"avx2", &avx2::table, &avx2::splat_table};
+        out[n++] = {"avx2", &avx2::table, &avx2::splat_table, &avx2::field_table};
 #endif
-    out[n++] = {"baseline", &baseline::table, &baseline::splat_table};
+    out[n++] = {"baseline", &baseline::table, &baseline::splat_table, &baseline::field_table};
     return n;
 }
 
@@ -44,6 +47,7 @@ Choice chosen = [] { Choice c[3]; choices(c); return c[0]; }();
 
 const Kernels& kernels() { return *chosen.table; }
 const SplatKernels& splat_kernels() { return *chosen.splats; }
+const FieldKernels& field_kernels() { return *chosen.fields; }
 const char* isa_name() { return chosen.name; }
 
 bool set_isa(const char* name) {

@@ -2,6 +2,7 @@
 #pragma once
 #include <cstdint>
 
+#include "field.h"
 #include "splats.h"
 
 namespace nerfvol {
@@ -104,6 +105,7 @@ struct Kernels {
 
 const Kernels& kernels();                        // the chosen instruction set
 const SplatKernels& splat_kernels();
+const FieldKernels& field_kernels();
 const char* isa_name();
 bool set_isa(const char* name);                  // "auto" or a name from available_isas(); false if this CPU lacks it
 int available_isas(const char** names);          // fills up to 3 names, best first

@@ -1,0 +1,70 @@
+"""A compiled field with the space that it fills: what is drawn, and what distilling evaluates (``nerfvol.field.fields``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nerfvol.kernels import field_ops
+from nerfvol.kernels.field_state import FieldState, Float, March
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nerfvol.cameras.camera import Camera
+
+
+class CompiledField:
+    """A field that is empty where its occupancy grid says so, as it was in training; the protocol of ``SHField`` and more.
+
+    The rest of it is whatever the network happens to hold in space that training skips. Points in skipped cells cost nothing.
+    """
+
+    def __init__(self, state: FieldState, march: March, background: Sequence[float]) -> None:
+        self.state, self.march, self.background = state, march, tuple(background)
+        self.has_sh = state.shape.head == "sh"
+        self.sh_degree = state.shape.sh_degree if self.has_sh else 0
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """(height, width, 3) float32 as ``camera`` sees it, clipped to [0, 1]."""
+        origin, directions = camera.rays()
+        origins = np.broadcast_to(np.asarray(origin, np.float32), directions.shape)
+        out = field_ops.render_rays(self.state, origins, directions, self.march, self.background, outputs=("rgb",))
+        return out["rgb"].clip(0, 1).reshape(camera.intrinsics.height, camera.intrinsics.width, 3)
+
+    def evaluate(self, positions: Float, values: bool = True) -> tuple[Float, Float | None]:
+        """sigma (n,) in 1/u at scene positions (n, 3) and, with ``values``, SH coefficients (n, 3, K); numpy arrays.
+
+        Raises:
+            ValueError: values are wanted of a field with an rgb head, which has no coefficients.
+        """
+        if values and not self.has_sh:
+            raise ValueError("this field has a view-dependent rgb head: it has no SH coefficients to give")
+        return field_ops.evaluate(self.state, positions, where=self.march, values=values)
+
+    def density(self, positions: Tensor) -> Tensor:
+        """(n, 3) -> sigma (n,) in 1/u."""
+        import torch
+
+        return torch.from_numpy(self.evaluate(positions.numpy(), values=False)[0])
+
+    def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """(n, 3) -> sigma (n,), sh (n, 3, (sh_degree + 1)**2); ValueError unless the field has the SH head."""
+        import torch
+
+        sigma, values = self.evaluate(positions.numpy())
+        return torch.from_numpy(sigma), torch.from_numpy(values)
+
+    def __call__(self, positions: Tensor, viewdirs: Tensor) -> tuple[Tensor, Tensor]:
+        """(n, 3), (n, 3) unit -> sigma (n,), rgb (n, 3)."""
+        import torch
+
+        if self.has_sh:
+            from nerfvol.sh import eval_colour
+
+            sigma, sh = self.sh(positions)
+            return sigma, eval_colour(sh, viewdirs)
+        sigma, rgb = field_ops.evaluate(self.state, positions.numpy(), viewdirs.numpy(), self.march)
+        return torch.from_numpy(sigma), torch.from_numpy(rgb)

@@ -1,0 +1,257 @@
+"""Training of a field by the compiled kernels, step by step; ``field_trainer`` has the same in torch and chooses.
+
+Every random number of step k comes from (seed, k), and all that lives between steps is in ``state_dict``: the same seed gives
+the same bits for any number of threads, stopped and resumed or not. What the schedule is worth: docs/experiments.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerfvol.config.training import FieldConfig
+from nerfvol.errors import InputError
+from nerfvol.field.layout import Domain
+from nerfvol.kernels import field_ops
+from nerfvol.kernels.field_model import CompiledField
+from nerfvol.kernels.field_ops import FieldBatch, FieldLoss, FieldRates, FieldState, March, Occupancy
+from nerfvol.native import native
+
+if TYPE_CHECKING:
+    from nerfvol.cameras.camera import Camera, Intrinsics
+    from nerfvol.datasets.dataset import Dataset
+    from nerfvol.training.field_trainer import FieldReport
+
+MOST_RAYS = 32768
+"""Of one step, while most of space is known to be empty."""
+COARSE_STEPS = ((64, 4), (256, 2))
+"""Until so many steps are done, steps along rays are so many times longer: all cells are occupied then."""
+SWEEPS = (64, 128, 256)
+"""After so many steps the whole region is looked at, one point a block of 2**3 cells ..."""
+PROBE_EVERY, PROBES = 32, 32768
+"""... and from then on, each so many steps, so many cells, half of them among the occupied ones."""
+SLOW_LEVELS, SLOW_EVERY = 3, 2
+"""Levels of the grid from this one on are moved at every second step, by the gradient of both: half the work of Adam."""
+NETWORK_DECAY = 1e-6
+WARM_UP = 20
+"""Steps over which the rate rises."""
+
+
+def _key(seed: int, step: int) -> int:
+    """64 bits that depend on both alone, mixed as in field.sampling.step_generator."""
+    key = 0
+    for word in (seed, step):
+        key = (key + word * 0xD1342543DE82EF95 + 0x9E3779B97F4A7C15) % 2**64
+        key = (key ^ key >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+        key = (key ^ key >> 27) * 0x94D049BB133111EB % 2**64
+        key ^= key >> 31
+    return key
+
+
+class Pixels:
+    """All training pixels of one image scale, to draw rays from: uint8 pictures and shared tables of pixel directions."""
+
+    def __init__(self, dataset: Dataset, background: Sequence[float], downscale: int) -> None:
+        compiled = native()
+        assert compiled is not None
+        cameras = [camera.scaled(downscale) for camera in dataset.cameras]
+        pictures = [np.ascontiguousarray(image) for image in dataset.pyramid(background, downscale)]
+        tables: dict[Intrinsics, np.ndarray] = {}
+        for camera in cameras:
+            if camera.intrinsics not in tables:
+                tables[camera.intrinsics] = np.ascontiguousarray(camera.intrinsics.directions().reshape(-1, 3))
+        poses = np.stack([camera.c2w for camera in cameras]).astype(np.float32)
+        rotations, origins = np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3])
+        self._drawn = compiled.field_draw
+        self._pixels = compiled.FieldPixels(pictures, [tables[c.intrinsics] for c in cameras], rotations, origins)
+
+    def sample(self, n_rays: int, seed: int, step: int) -> FieldBatch:
+        """Random pixels, evenly over all pictures."""
+        o, d, target = (np.empty((n_rays, 3), np.float32) for _ in range(3))
+        jitter = np.empty(n_rays, np.float32)
+        self._drawn(self._pixels, _key(seed, step), o, d, target, jitter)
+        return FieldBatch(o, d, target, jitter)
+
+
+class CompiledFieldTrainer:
+    """Trains one field on one dataset, a step at a time; a phase (training.phase.Phase).
+
+    Args:
+        dataset: posed images.
+        domain: the field's region.
+        config: see ``FieldConfig``.
+        seed: all randomness.
+        background: RGB that images with alpha are composited on and that lies behind the field.
+        near_plane: nothing nearer to a camera is looked at, u.
+    """
+
+    name = "field"
+    rates = "field.rate"
+    previews = (0.1, 0.4, 1.0)
+    preview_width = 400
+    stages_left = 0
+    most_steps = math.inf
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        domain: Domain,
+        config: FieldConfig,
+        seed: int = 0,
+        background: Sequence[float] = (1.0, 1.0, 1.0),
+        near_plane: float = 0.0,
+    ) -> None:
+        self.dataset, self.seed, self.domain = dataset, seed, domain
+        self.few = len(dataset) <= config.few_views
+        shape = dataclasses.replace(config.shape, sh_degree=0) if self.few else config.shape
+        self.config = dataclasses.replace(config, shape=shape)
+        self.background = (float(background[0]), float(background[1]), float(background[2]))
+        self.state = FieldState(domain, shape, seed)
+        self.occupancy = Occupancy(domain, config.grid_resolution)
+        self.steps_done, self.stage = 0, 0  # an image scale is no stage: nothing else changes with it
+        self.march = March(self.occupancy, config.march_steps[-1], near_plane)
+        self.n_rays = max(1, config.samples_per_step // 64)
+        self._pixels: dict[int, Pixels] = {}
+
+    # ------------------------------------------------------------------ what a run asks of a phase
+    @property
+    def steps(self) -> int:
+        """Of the whole schedule without a time budget."""
+        return self.config.steps
+
+    @property
+    def parameter_bytes(self) -> int:
+        """Bytes of the grid's entries and of the network."""
+        return self.state.nbytes
+
+    def share_of(self, seconds: float) -> float:
+        """``field.time_budget``, and at most FIELD_SHARE: an octree must follow."""
+        from nerfvol.training.field_trainer import FIELD_SHARE
+
+        return min(self.config.time_budget, FIELD_SHARE * seconds)
+
+    def size(self) -> str:
+        """See Phase."""
+        return f"{self.n_rays} rays"
+
+    def seconds_to_write(self) -> float:
+        """Distilling comes first."""
+        return 2.0
+
+    def needs_images(self) -> bool:
+        """The octree will."""
+        return True
+
+    def outgrown(self) -> str | None:
+        """A field does not grow."""
+        return None
+
+    def picture(self, camera: Camera) -> np.ndarray:
+        """(height, width, 3) float32 image of the field as ``camera`` sees it."""
+        return self.trained_field().picture(camera)
+
+    def trained_field(self) -> CompiledField:
+        """The field without what it holds in space that training skips: what is to be rendered or distilled."""
+        return CompiledField(self.state, self.march, self.background)
+
+    # ------------------------------------------------------------------ training
+    def step(self, progress: float | None = None) -> FieldReport:
+        """One optimisation step.
+
+        Args:
+            progress: how much of the run is over, 0 to 1; None = steps done / ``config.steps``.
+        """
+        from nerfvol.training.field_trainer import FieldReport
+
+        config = self.config
+        progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
+        stage = config.stage_at(progress)
+        batch = self._bank(config.downscales[stage]).sample(self.n_rays, self.seed, self.steps_done)
+        longer = next((factor for until, factor in COARSE_STEPS if self.steps_done < until), 1)
+        self.march = self.march.with_steps(max(8, config.march_steps[stage] // longer))
+        moves = [level < SLOW_LEVELS or self.steps_done % SLOW_EVERY == 1 for level in range(self.state.n_levels)]
+        report = field_ops.train_step(self.state, batch, self.march, self._loss(progress), self._rates(progress), moves)
+        self.steps_done += 1
+        self._look()
+        n_rays = self.n_rays
+        self._follow_samples(report.samples / n_rays)
+        return FieldReport(
+            squared_error=report.squared_error, samples=report.samples / n_rays, loss=report.loss, n_rays=n_rays,
+            downscale=config.downscales[stage],
+        )  # fmt: skip
+
+    def _loss(self, progress: float) -> FieldLoss:
+        config, fading = self.config, 0.1**progress
+        entropy = config.entropy_weight
+        return FieldLoss(self.background, fading * config.colour_weight, fading * config.distortion_weight, entropy)
+
+    def _rates(self, progress: float) -> FieldRates:
+        config = self.config
+        warm = min(1.0, (self.steps_done + 1) / WARM_UP)
+        decay = config.rate_decay ** max(0.0, (progress - 1 / 3) * 1.5)
+        table_decay = config.few_decay if self.few else config.table_decay
+        return FieldRates(config.rate * warm * decay, table_decay=table_decay, network_decay=NETWORK_DECAY)
+
+    def _look(self) -> None:
+        """Look at cells that samples may not have been in, so that empty ones are found and space can come back."""
+        grid, r = self.occupancy, self.occupancy.resolution
+        if self.steps_done in SWEEPS:
+            blocks = np.stack(np.unravel_index(np.arange(grid.cubes * (r // 2) ** 3), (grid.cubes, *[r // 2] * 3)), 1)
+            low = np.ravel_multi_index((blocks[:, 0], *(2 * blocks[:, 1:].T)), (grid.cubes, r, r, r))
+            seen = self._seen(low, 2)
+            for offset in np.ndindex(2, 2, 2):
+                grid.note(low + (offset[0] * r + offset[1]) * r + offset[2], seen)
+        elif self.steps_done > SWEEPS[-1] and self.steps_done % PROBE_EVERY == 0:
+            rng = self._rng()
+            held = np.flatnonzero(grid.cells().reshape(-1))
+            anywhere = rng.integers(len(grid.sigmas), size=PROBES // 2)
+            cells = np.concatenate([anywhere, held[rng.integers(len(held), size=PROBES // 2)]])
+            grid.note(cells, self._seen(cells, 1))
+        else:
+            return
+        grid.refresh()
+        if not grid.occupied.any():
+            raise InputError(
+                "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
+                "the images' background and that the scene bounds contain the object, lower field.rate, or start with "
+                "--init direct"
+            )
+
+    def _rng(self) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(key=[self.seed, 1 + self.steps_done]))
+
+    def _seen(self, cells: np.ndarray, size: int) -> np.ndarray:
+        positions = self.occupancy.positions(cells, self._rng().random((len(cells), 3)), size)
+        return field_ops.evaluate(self.state, positions, values=False)[0]
+
+    def _follow_samples(self, per_ray: float) -> None:
+        """Choose the next number of rays so that a step has about ``samples_per_step`` samples."""
+        wanted = self.config.samples_per_step / max(per_ray, 0.25)
+        self.n_rays = max(1, min(MOST_RAYS, int(min(wanted, 1.25 * self.n_rays + 16))))
+
+    def _bank(self, downscale: int) -> Pixels:
+        if downscale not in self._pixels:
+            self._pixels = {downscale: Pixels(self.dataset, self.background, downscale)}
+        return self._pixels[downscale]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that lives between steps, as arrays and numbers."""
+        return {
+            "field": self.state.arrays(),
+            "grid": self.occupancy.state_dict(),
+            "steps_done": self.steps_done,
+            "n_rays": self.n_rays,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of ``state_dict``; InputError where the state is of another network."""
+        try:
+            self.state.load_arrays(state["field"])
+            self.occupancy.load_state_dict(state["grid"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"the checkpoint's field does not fit the configured network: {error}") from error
+        self.steps_done, self.n_rays = int(state["steps_done"]), int(state["n_rays"])
