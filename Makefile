@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint sanitize clang no-compiler clean
+.PHONY: demo test lint sanitize clang no-compiler clients clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -37,6 +37,11 @@ clang: $(BIN)/python
 no-compiler: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python tools/no_compiler.py
+
+# What Blender and VTK make of the exports in the folder EXPORTS; by hand, for both are large.
+clients: $(BIN)/python
+	$(BIN)/pip install -q numpy bpy vtk
+	$(BIN)/python tools/clients.py $(EXPORTS)
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

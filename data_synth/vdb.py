@@ -1,8 +1,8 @@
 """Reading OpenVDB files (Museth 2013; the layout follows OpenVDB's io, version 222+); vdb_write.py writes them.
 
-Covers what density volumes need: grids of float and of vec3s (``Tree_float_5_4_3``), stored as float or half, uncompressed or zip, with or
-without active-mask compression, under a scale and translation. Blosc is named and refused. Nothing is executed and all
-sizes are checked against the file, so a truncated or hostile file is an ``InputError``.
+Covers what density volumes need: grids of float and of vec3s (``Tree_float_5_4_3``), stored as float or half, uncompressed
+or zip, with or without active-mask compression, under a scale and translation. Blosc is named and refused. Nothing is
+executed and all sizes are checked against the file, so a truncated or hostile file is an ``InputError``.
 """
 
 from __future__ import annotations

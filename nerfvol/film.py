@@ -59,7 +59,9 @@ class Film:
         """
         wanted = {"rgb"}
         for name in (self.output, *self.aov):
-            wanted |= {"depth": {"depth", "opacity"}, "normal": {"normal", "opacity"}}.get(name, {name} if name == "rgb" else {name, "opacity"})
+            wanted |= {"depth": {"depth", "opacity"}, "normal": {"normal", "opacity"}}.get(
+                name, {name} if name == "rgb" else {name, "opacity"}
+            )
         outputs = [name for name in OUTPUTS if name in wanted]
         for index, camera in enumerate(self.cameras):
             if sys.stderr.isatty():
@@ -119,7 +121,9 @@ def write_picture(path: Path, film: Film) -> list[Path]:
         InputError: there are more views, or a path that cannot be written.
     """
     if len(film.cameras) != 1:
-        raise InputError(f"{path} is one picture and there are {len(film.cameras)} views: give --out a folder or a video")
+        raise InputError(
+            f"{path} is one picture and there are {len(film.cameras)} views: give --out a folder or a video"
+        )
     depths = depth_range(film.model, film.cameras)
     paths = {film.output: path, **{name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in film.aov}}
     for images in film.together():

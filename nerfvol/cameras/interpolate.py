@@ -1,9 +1,10 @@
 """Smooth cameras between keyframes.
 
-Positions: the Catmull-Rom spline with centripetal knots, which has neither cusps nor loops between keyframes (Yuksel, Schaefer &
-Keyser 2011). Rotations: squad, the spherical cubic through unit quaternions (Shoemake 1987), with tangents for the same knots: where
-these are even they are Shoemake's. Time runs along the knots, an interval being the square root of how far apart two keyframes
-are, in place (in mean steps) and in angle (in half turns), so that speed and turning change without a jump.
+Positions: the Catmull-Rom spline with centripetal knots, which has neither cusps nor loops between keyframes (Yuksel,
+Schaefer & Keyser 2011). Rotations: squad, the spherical cubic through unit quaternions (Shoemake 1987), with tangents for
+the same knots: where these are even they are Shoemake's. Time runs along the knots, an interval being the square root of
+how far apart two keyframes are, in place (in mean steps) and in angle (in half turns), so that speed and turning change
+without a jump.
 """
 
 from __future__ import annotations
@@ -98,8 +99,11 @@ def _conjugate(q: Float) -> Float:
 
 
 def _log(q: Float) -> Float:
-    """(n, 3) rotation vectors, angle times axis, of unit quaternions (n, 4), the shorter way round."""
-    q = np.where(q[:, :1] < 0, -q, q)
+    """(n, 3) rotation vectors, angle times axis, of unit quaternions (n, 4).
+
+    q and -q turn alike, -q the longer way round: keyframes are given signs that are near (:func:`_aligned`), and what is made
+    between them stays on its side, for a change of sides halfway is a jump.
+    """
     length = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
     angle = 2 * np.arctan2(length, q[:, :1])
     return q[:, 1:] * np.where(length > 1e-12, angle / np.maximum(length, 1e-12), 2.0)

@@ -1,12 +1,13 @@
 """Camera paths that other tools save, as documents of our own (cameras/paths.py reads those).
 
-- nerfstudio's viewer, ``camera_path.json``: ``camera_path`` with ``camera_to_world`` of 16 numbers (OpenGL axes) and ``fov``, vertical,
-  degrees; ``render_width``, ``render_height``, ``fps``, ``seconds``, ``is_cycle``. Its poses are in the coordinates of its data loader,
-  x' = scale (R x + t); where ``dataparser_transforms.json`` lies beside the path they are taken back to the data set's.
-- 3D Gaussian splatting, ``cameras.json``: a list of ``position``, ``rotation`` (camera to world, OpenCV axes), ``fx``, ``fy``, ``width``,
-  ``height``.
-- instant-ngp, ``base_cam.json``: ``path`` of ``R`` (a quaternion x, y, z, w), ``T`` and ``fov`` (vertical, degrees), in its unit cube:
-  positions 0.33 x + 0.5, then axes cycled (y, z, x), OpenCV axes of the camera; ``loop``.
+- nerfstudio's viewer, ``camera_path.json``: ``camera_path`` with ``camera_to_world`` of 16 numbers (OpenGL axes) and
+  ``fov``, vertical, degrees; ``render_width``, ``render_height``, ``fps``, ``seconds``, ``is_cycle``. Its poses are in the
+  coordinates of its data loader, x' = scale (R x + t); where ``dataparser_transforms.json`` lies beside the path they are
+  taken back to the data set's.
+- 3D Gaussian splatting, ``cameras.json``: a list of ``position``, ``rotation`` (camera to world, OpenCV axes), ``fx``,
+  ``fy``, ``width``, ``height``.
+- instant-ngp, ``base_cam.json``: ``path`` of ``R`` (a quaternion x, y, z, w), ``T`` and ``fov`` (vertical, degrees), in its
+  unit cube: positions 0.33 x + 0.5, then axes cycled (y, z, x), OpenCV axes of the camera; ``loop``.
 """
 
 from __future__ import annotations
@@ -124,7 +125,12 @@ def _nerfstudio(path: str | os.PathLike[str], document: Mapping[str, Any]) -> di
         if document.get(theirs) is not None:
             shared[ours] = document[theirs]
     timing = {key: document[key] for key in ("fps", "seconds") if isinstance(document.get(key), int | float)}
-    return {**shared, **timing, "loop": document.get("is_cycle") is True, "frames": _each(path, document["camera_path"], read)}
+    return {
+        **shared,
+        **timing,
+        "loop": document.get("is_cycle") is True,
+        "frames": _each(path, document["camera_path"], read),
+    }
 
 
 def _nerfstudio_frame(beside: Path) -> Callable[[Float, Float], tuple[Float, Float]]:

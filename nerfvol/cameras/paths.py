@@ -32,7 +32,8 @@ LARGEST_SIDE = 16384
 
 @dataclass(frozen=True)
 class CameraPath:
-    """What a file says: its cameras; loop: the last is followed by the first; keyframes: whether to interpolate between them; fps
+    """What a file says: its cameras; loop: the last is followed by the first; keyframes: whether to interpolate between
+    them; fps
     and seconds: None where it does not say."""
 
     cameras: list[Camera]
@@ -48,7 +49,8 @@ def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = No
 
 
 def load_path(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> CameraPath:
-    """The camera path in a JSON file of ours or another tool's (path_files.py), resized to ``size`` (width, height) where given;
+    """The camera path in a JSON file of ours or another tool's (path_files.py), resized to ``size`` (width, height) where
+    given;
     800x800 where nobody states one.
 
     Raises:

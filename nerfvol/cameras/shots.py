@@ -1,8 +1,8 @@
 """Camera moves that people ask for by name, fitted to a scene: orbit, ellipse, spiral, lemniscate.
 
-All of them are closed, look at the scene's centre and keep the orbit's lens (paths.describe_orbit). ``ellipse`` is the one through the
-training cameras' plane (mip-NeRF 360), ``spiral`` that of LLFF for scenes seen from one side, ``lemniscate`` a figure of eight (Gerono's)
-in azimuth and elevation.
+All of them are closed, look at the scene's centre and keep the orbit's lens (paths.describe_orbit). ``ellipse`` is the one
+through the training cameras' plane (mip-NeRF 360), ``spiral`` that of LLFF for scenes seen from one side, ``lemniscate`` a
+figure of eight (Gerono's) in azimuth and elevation.
 """
 
 from __future__ import annotations
@@ -44,9 +44,7 @@ def moving_cameras(
     return MOVES[name](count, orbit, size, seen)
 
 
-def _orbit(
-    count: int, orbit: Mapping[str, Any], size: tuple[int, int] | None, seen: Sequence[Camera]
-) -> list[Camera]:
+def _orbit(count: int, orbit: Mapping[str, Any], size: tuple[int, int] | None, seen: Sequence[Camera]) -> list[Camera]:
     return orbit_cameras(count, orbit, size)
 
 
@@ -85,9 +83,7 @@ def _ellipse(
     return _towards(eyes, orbit, size)
 
 
-def _spiral(
-    count: int, orbit: Mapping[str, Any], size: tuple[int, int] | None, seen: Sequence[Camera]
-) -> list[Camera]:
+def _spiral(count: int, orbit: Mapping[str, Any], size: tuple[int, int] | None, seen: Sequence[Camera]) -> list[Camera]:
     """Two turns about the mean camera, as wide as nine of ten training cameras stood off it, half a period in depth."""
     center = np.asarray(orbit["center"], np.float64)
     (middle,) = _towards(_mean_place(orbit, seen)[None], orbit, size)

@@ -51,8 +51,8 @@ class RenderOptions:
 def arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options to the parser ``p``."""
     add_target(p)
-    p.add_argument("--path", metavar="orbit|ellipse|spiral|lemniscate|FILE", help="a move around the scene, as the training cameras "
-                   "stood, or a file: our JSON or that of nerfstudio, 3DGS or instant-ngp (docs/cli.md)")  # fmt: skip
+    p.add_argument("--path", metavar="orbit|ellipse|spiral|lemniscate|FILE", help="a move around the scene, as the training "
+                   "cameras stood, or a file: our JSON or that of nerfstudio, 3DGS or instant-ngp (docs/cli.md)")  # fmt: skip
     p.add_argument("--cameras", metavar="FILE.json", help="the same as --path FILE: each camera of the file a picture")
     p.add_argument("--orbit", metavar="N", help="the same as --path orbit --frames N")
     p.add_argument("--frames", metavar="N", help="pictures; between the cameras of a file as a smooth path through them "
@@ -61,7 +61,9 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--fps", metavar="F", help="frames a second of a video (default: what the file says, or 30)")
     p.add_argument("--loop", action="store_true", help="the path through a file's cameras comes back to the first")
     p.add_argument("--size", metavar="WxH", help="picture size (default: that of the cameras, or 800x800)")
-    p.add_argument("--out", metavar="DIR|FILE", help=f"folder for pictures, a video ({', '.join(VIDEO_ENDINGS)}), or one .png")
+    p.add_argument(
+        "--out", metavar="DIR|FILE", help=f"folder for pictures, a video ({', '.join(VIDEO_ENDINGS)}), or one .png"
+    )
     p.add_argument("--output", metavar="rgb|depth|median_depth|opacity|normal", help="what is shown (default: rgb)")
     p.add_argument("--aov", metavar="LIST", help="also write depth,median_depth,opacity,normal")
     p.add_argument("--compare", metavar="RUN|FILE", help="a second model, to the right of the first")
@@ -92,12 +94,21 @@ def run(options: RenderOptions) -> int:
     if ending in VIDEO_ENDINGS and len({(c.intrinsics.width, c.intrinsics.height) for c in cameras}) > 1:
         cameras = of_one_size(cameras)
         lens = cameras[0].intrinsics
-        print(f"the cameras have several sizes: all are drawn at the first one's, {lens.width}x{lens.height} (or give --size)")
+        print(
+            f"the cameras have several sizes: all are drawn at the first one's, {lens.width}x{lens.height} (or give --size)"
+        )
     if ending == ".png" and len(cameras) != 1:
         raise InputError(f"{out} is one picture and there are {len(cameras)} views: give --out a folder or a video")
     prepare_outputs(folder=str(out.parent if ending else out))
     film = Film(
-        target.model, cameras, target.background, options.aov, options.early_stop_eps, options.lod, options.output, compare
+        target.model,
+        cameras,
+        target.background,
+        options.aov,
+        options.early_stop_eps,
+        options.lod,
+        options.output,
+        compare,
     )
     started = time.perf_counter()
     if ending in VIDEO_ENDINGS:
@@ -113,7 +124,9 @@ def run(options: RenderOptions) -> int:
 def _check_path_options(options: RenderOptions) -> None:
     given = [name for name in ("path", "cameras", "orbit") if getattr(options, name) is not None]
     if not given:
-        raise InputError("nerfvol render needs --path orbit|ellipse|spiral|lemniscate|FILE (or --cameras FILE.json or --orbit N)")
+        raise InputError(
+            "nerfvol render needs --path orbit|ellipse|spiral|lemniscate|FILE (or --cameras FILE.json or --orbit N)"
+        )
     if len(given) > 1:
         raise InputError(f"--{given[0]} and --{given[1]} both say where the cameras are: give one of them")
     if options.frames is not None and options.seconds is not None:
@@ -129,7 +142,9 @@ def _ending(options: RenderOptions) -> str:
     if out.is_dir() or options.out.endswith("/"):
         return ""
     if ending in FOREIGN:
-        raise InputError(f"{ending} is not written: expected {', '.join(VIDEO_ENDINGS)}, .png for one view, or a folder")
+        raise InputError(
+            f"{ending} is not written: expected {', '.join(VIDEO_ENDINGS)}, .png for one view, or a folder"
+        )
     if ending not in (*VIDEO_ENDINGS, ".png"):
         return ""
     if options.format == "exr":

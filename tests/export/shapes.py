@@ -7,7 +7,7 @@ import numpy as np
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
 
-CENTER, RADIUS = np.array([0.3, -0.2, 0.5]), 0.6
+CENTER, RADIUS = np.array([0.3, -0.2, 0.25]), 0.6
 """Off the middle of everything, so that turned or mirrored axes show."""
 LOW, HIGH = np.array([-0.5, 0.25, -0.75]), np.array([0.5, 0.75, 0.25])
 """Corners of the cube, of three different extents; x < 0 is red, x > 0 blue."""
@@ -36,7 +36,9 @@ def ball(level: int = 5, degree: int = 0) -> Octree:
 
 
 def box(level: int = 4, mixed: bool = True) -> Octree:
-    """The cube of LOW and HIGH, of optical depth 4 along a leaf of ``level``; half of its leaves are one level coarser if mixed."""
+    """The cube of LOW and HIGH, of optical depth 4 along a leaf of ``level``; half of its leaves are one level coarser if
+    mixed."""
+
     def inside(p):
         return ((p > LOW) & (p < HIGH)).all(axis=1)
 

@@ -38,7 +38,9 @@ def test_colmap(tmp_path, cameras):
     lenses, images = read_cameras(tmp_path / "sparse"), list(read_images(tmp_path / "sparse"))
     assert len(lenses) == 4 and [image.name for image in images] == [f"photo_{i}.jpg" for i in range(8)]
     point = np.array([0.2, -0.1, 0.3])
-    for line, ours in zip((tmp_path / "sparse" / "images.txt").read_text().splitlines()[1::2], cameras.cameras, strict=True):
+    for line, ours in zip(
+        (tmp_path / "sparse" / "images.txt").read_text().splitlines()[1::2], cameras.cameras, strict=True
+    ):
         numbers = np.array(line.split()[1:8], float)
         x, y, z = rotations(numbers[None, :4])[0] @ point + numbers[4:]
         lens = lenses[int(line.split()[8])].intrinsics(ours.intrinsics.width, ours.intrinsics.height)

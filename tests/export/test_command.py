@@ -49,7 +49,8 @@ def test_refusals_follow_from_the_rows(monkeypatch):
     with pytest.raises(InputError, match=r"holds splats, this is a model of octree, which goes to \.npz"):
         choose("a.ply", "octree", "splats")
     with pytest.raises(
-        InputError, match=r"\.npz \(grid\) holds octree, .* goes to \.ply \(points\) or \.ply \(splats\)"
+        InputError,
+        match=r"\.npz \(grid\) holds octree, .* goes to \.ply \(leaves\), \.ply \(points\), \.ply \(splats\) or",
     ):
         choose("a.npz", "splats")
     assert choose("a.ply", "octree", "leaves").name == "leaves"  # by name alone

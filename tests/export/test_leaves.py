@@ -21,7 +21,8 @@ def psnr(a, b):
 
 
 def test_a_leaf_keeps_its_optical_depth():
-    """What a Gaussian stops of the light through the leaf's face, in closed form: opacity x 2 pi s^2 = opacity x h^2 x 1.005."""
+    """What a Gaussian stops of the light through the leaf's face, in closed form: opacity x 2 pi s^2 = opacity x h^2 x
+    1.005."""
     octree = box()
     splats = splats_of_leaves(octree)
     side, opacity = octree.leaf_sizes(), 1 / (1 + np.exp(-splats.logits.astype(float)))

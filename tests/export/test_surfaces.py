@@ -60,9 +60,14 @@ def test_glb_colours_are_linear_and_unlit(tmp_path, cube):
     views = document["bufferViews"]
     places = np.frombuffer(data, "<f4", offset=views[0]["byteOffset"], count=3 * count).reshape(-1, 3)
     colours = np.frombuffer(data, "<u2", offset=views[1]["byteOffset"], count=4 * count).reshape(-1, 4)[:, :3] / 65535
-    assert np.allclose(places.min(0), document["accessors"][0]["min"]) and np.allclose(places.max(0), document["accessors"][0]["max"])
+    assert np.allclose(places.min(0), document["accessors"][0]["min"]) and np.allclose(
+        places.max(0), document["accessors"][0]["max"]
+    )
     for chosen, colour in ((places[:, 0] < -0.15, RED), (places[:, 0] > 0.05, BLUE)):
-        assert chosen.sum() > 200 and np.abs(np.median(colours[chosen], axis=0) - srgb_to_linear(np.array(colour))).max() < 0.01
+        assert (
+            chosen.sum() > 200
+            and np.abs(np.median(colours[chosen], axis=0) - srgb_to_linear(np.array(colour))).max() < 0.01
+        )
     # y up: (x, z, -y)
     low, high = np.array([LOW[0], LOW[2], -HIGH[1]]), np.array([HIGH[0], HIGH[2], -LOW[1]])
     voxel = (HIGH - LOW).max() / RESOLUTION

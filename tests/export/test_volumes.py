@@ -70,11 +70,15 @@ def read_htg(path):
     kinds = {"Float64": "<f8", "Int64": "<i8", "UInt32": "<u4", "Bit": "u1", "Float32": "<f4", "UInt8": "u1"}
     for kind, name, offset in re.findall(r'type="(\w+)" Name="(\w+)".*?offset="(\d+)"', head):
         (n,) = struct.unpack_from("<Q", data, start + int(offset))
-        found[name] = np.frombuffer(data, kinds[kind], offset=start + int(offset) + 8, count=n // np.dtype(kinds[kind]).itemsize)
+        found[name] = np.frombuffer(
+            data, kinds[kind], offset=start + int(offset) + 8, count=n // np.dtype(kinds[kind]).itemsize
+        )
     low = np.array([found[f"{a}Coordinates"][0] for a in "XYZ"])
     side = found["XCoordinates"][1] - found["XCoordinates"][0]
     counts = found["NumberOfVerticesPerDepth"]
-    refined = np.concatenate([np.unpackbits(found["Descriptors"])[: sum(counts[:-1])], np.zeros(counts[-1])]).astype(bool)
+    refined = np.concatenate([np.unpackbits(found["Descriptors"])[: sum(counts[:-1])], np.zeros(counts[-1])]).astype(
+        bool
+    )
     masked, corners, at, leaves = np.unpackbits(found["Mask"])[: sum(counts)].astype(bool), [low], 0, []
     for count in counts:
         below = []
@@ -120,7 +124,9 @@ def test_nifti_colours(tmp_path, cube):
     assert values.dtype.names == ("R", "G", "B")
     rgb = np.stack([values[c] for c in "RGB"], -1)
     x = nibabel.affines.apply_affine(image.affine, np.argwhere(rgb[..., 0] >= 0))[:, 0].reshape(rgb.shape[:3])
-    assert (rgb[x < -0.26] == np.rint(255 * np.array(RED))).all() and (rgb[x > 0] == np.rint(255 * np.array(BLUE))).all()
+    assert (rgb[x < -0.26] == np.rint(255 * np.array(RED))).all() and (
+        rgb[x > 0] == np.rint(255 * np.array(BLUE))
+    ).all()
 
 
 def test_vti(tmp_path):
@@ -137,10 +143,13 @@ def test_vti(tmp_path):
 
 
 def svox_leaves(path):
-    """What svox's N3Tree.load and its world-to-tree transform make of the file: corner, side, sigma, rgb of the constant band."""
+    """What svox's N3Tree.load and its world-to-tree transform make of the file: corner, side, sigma, rgb of the constant
+    band."""
     with np.load(path) as z:
         child, data, radius, offset = z["child"], z["data"].astype(np.float64), z["invradius3"], z["offset"]
-        assert z["parent_depth"].shape == (len(child), 2) and int(z["n_internal"]) == len(child) and not int(z["n_free"])
+        assert (
+            z["parent_depth"].shape == (len(child), 2) and int(z["n_internal"]) == len(child) and not int(z["n_free"])
+        )
         assert int(z["data_dim"]) == data.shape[-1] and str(z["data_format"]) == f"SH{(data.shape[-1] - 1) // 3}"
         packed, depth = z["parent_depth"].T
     leaves, stack = [], [(0, np.zeros(3), 0.5)]
@@ -167,11 +176,14 @@ def test_plenoctree_as_svox_reads_it(tmp_path, cube):
     assert np.allclose(ours[np.lexsort(ours.T.round(5))], theirs[np.lexsort(theirs.T.round(5))], atol=1e-6)
     assert np.allclose(leaves[:, 4], SIGMA, rtol=2**-11)
     rgb = 1 / (1 + np.exp(-leaves[:, 5:] * 0.28209479177387814))
-    assert np.allclose(rgb[leaves[:, 0] < -0.26], RED, atol=2e-3) and np.allclose(rgb[leaves[:, 0] >= 0], BLUE, atol=2e-3)
+    assert np.allclose(rgb[leaves[:, 0] < -0.26], RED, atol=2e-3) and np.allclose(
+        rgb[leaves[:, 0] >= 0], BLUE, atol=2e-3
+    )
 
 
 def test_plenoctree_colours_of_degree_one(tmp_path):
-    """sigmoid of svox's coefficients along a direction is our colour there, to what a logit fit can: 64 directions, small bands."""
+    """sigmoid of svox's coefficients along a direction is our colour there, to what a logit fit can: 64 directions, small
+    bands."""
     octree = ball(3, degree=1)
     sh = octree.sh
     sh[:, :, 1:] = np.random.default_rng(0).normal(0, 0.05, sh[:, :, 1:].shape)
@@ -180,7 +192,9 @@ def test_plenoctree_colours_of_degree_one(tmp_path):
     leaves = svox_leaves(tmp_path / "a.npz")
     places = leaves[:, :3] + leaves[:, 3:4] / 2
     d = np.array([0.6, -0.48, 0.64])
-    basis = np.array([0.28209479177387814, -0.4886025119029199 * d[1], 0.4886025119029199 * d[2], -0.4886025119029199 * d[0]])
+    basis = np.array(
+        [0.28209479177387814, -0.4886025119029199 * d[1], 0.4886025119029199 * d[2], -0.4886025119029199 * d[0]]
+    )
     leaf = octree.query(places)
     ours = 0.5 + octree.sh[octree.corners[leaf]].mean(axis=1) @ basis
     theirs = 1 / (1 + np.exp(-leaves[:, 5:].reshape(-1, 3, 4) @ basis))
@@ -191,7 +205,9 @@ def test_plenoctree_colours_of_degree_one(tmp_path):
 def test_plenoctree_comes_back(tmp_path, cube):
     export_model(cube, tmp_path / "a.npz", "plenoctree")
     again = load_model(tmp_path / "a.npz").octree
-    assert np.array_equal(again.leaf_level, cube.octree.leaf_level) and np.array_equal(again.leaf_ijk, cube.octree.leaf_ijk)
+    assert np.array_equal(again.leaf_level, cube.octree.leaf_level) and np.array_equal(
+        again.leaf_ijk, cube.octree.leaf_ijk
+    )
     assert np.allclose(again.origin, ORIGIN, atol=1e-6) and again.size == pytest.approx(SIZE)
     assert np.allclose(octree_density(again, again.leaf_centers()), SIGMA, rtol=1e-3)
     x = again.vertex_positions()[:, 0]
@@ -228,7 +244,11 @@ def test_levels_sizes_and_boxes(tmp_path):
     assert (full.level, coarse.level) == (5, 4) and coarse.size < full.size
     assert np.allclose(read_vdb(tmp_path / "b.vdb").voxel_size, SIZE / 16)
     fitting = export_model(model, tmp_path / "c.vdb", max_bytes=coarse.size)
-    assert (fitting.level, fitting.size) == (4, coarse.size) and {p.name for p in tmp_path.iterdir()} == {"a.vdb", "b.vdb", "c.vdb"}
+    assert (fitting.level, fitting.size) == (4, coarse.size) and {p.name for p in tmp_path.iterdir()} == {
+        "a.vdb",
+        "b.vdb",
+        "c.vdb",
+    }
     with pytest.raises(InputError, match="--max-bytes 10: .*even at level 1"):
         export_model(model, tmp_path / "d.vdb", max_bytes=10)
     export_model(model, tmp_path / "e.vdb", crop=(-1, -1, -1, 0.3, 1, 1))
