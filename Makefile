@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint sanitize clang no-compiler wasm clean
+.PHONY: demo test lint sanitize clang no-compiler clients wasm clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -41,6 +41,11 @@ no-compiler: $(BIN)/python
 # The kernels of web pages; what it makes is committed (tools/web_kernels.py says what it takes).
 wasm:
 	$(PYTHON) tools/web_kernels.py
+
+# What Blender and VTK make of the exports in the folder EXPORTS; by hand, for both are large.
+clients: $(BIN)/python
+	$(BIN)/pip install -q numpy bpy vtk
+	$(BIN)/python tools/clients.py $(EXPORTS)
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

@@ -1,8 +1,8 @@
 """Writing sparse OpenVDB files: grids of numbers and of vectors (Museth 2013; the layout follows OpenVDB's io, version 224).
 
-The one writer of the project: ground truth (``volumes.write_density``) and exported models (``nerfvol.export.vdb``) go through
-it. Only active voxels are stored, in half or single precision, deflated block by block ("zip + active values"). A grid carries the
-metadata without which programs show it as a nameless volume of size 0: its name, class and bounding box.
+The one writer of the project: ground truth (``volumes.write_density``) and exported models (``nerfvol.export.vdb``) go
+through it. Only active voxels are stored, in half or single precision, deflated block by block ("zip + active values"). A
+grid carries the metadata without which programs show it as a nameless volume of size 0: its name, class and bounding box.
 """
 
 from __future__ import annotations
@@ -123,7 +123,11 @@ class _Layout:
 
     def _check(self, path: str | os.PathLike, coords: np.ndarray, values: np.ndarray) -> None:
         name = self.grid.name
-        if not len(coords) or coords.shape != (len(values), 3) or values.shape not in ((len(coords),), (len(coords), 3)):
+        if (
+            not len(coords)
+            or coords.shape != (len(values), 3)
+            or values.shape not in ((len(coords),), (len(coords), 3))
+        ):
             raise InputError(
                 f"{path}: the grid {name} needs active voxels (n, 3) and as many values, got {coords.shape} and {values.shape}"
             )

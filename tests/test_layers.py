@@ -91,7 +91,11 @@ def climbing(source: str, module: str, is_package: bool = False) -> list[str]:
     own, wrong = room(module), []
     for name in imports(source, module, is_package):
         shared = SHARED_FILES.get(module)
-        if name.split(".")[0] == ONLY_COMMANDS and own != "cli" and not (shared and f"{name}.".startswith(f"{shared}.")):
+        if (
+            name.split(".")[0] == ONLY_COMMANDS
+            and own != "cli"
+            and not (shared and f"{name}.".startswith(f"{shared}."))
+        ):
             wrong.append(name)
         if name.split(".")[0] == "nerfvol" and own is not None and (theirs := room(name)) is not None:
             if PACKAGES.index(theirs) > PACKAGES.index(own) or theirs in FORBIDDEN.get(own, ()):

@@ -369,8 +369,8 @@ def test_a_disk_that_takes_no_more(tmp_path, octree_file, out):
 @pytest.mark.parametrize(
     "arguments, reason",
     [
-        (["--out", "x"], "either --cameras FILE.json or --orbit N"),
-        (["--orbit", "2", "--cameras", "c.json", "--out", "x"], "either --cameras"),
+        (["--out", "x"], "or --cameras FILE.json or --orbit N"),
+        (["--orbit", "2", "--cameras", "c.json", "--out", "x"], "both say where the cameras are"),
         (["--orbit", "2"], "needs --out"),
         (["--orbit", "0", "--out", "x"], "orbit: expected a number of at least 1"),
         (["--orbit", "many", "--out", "x"], "orbit: expected a whole number"),

@@ -1,4 +1,4 @@
-"""Where to look from: camera paths in JSON files, and the orbit that fits a scene. docs/cli.md has the JSON's fields.
+"""Where to look from: camera paths in JSON files, and paths that fit a scene. docs/cli.md has the JSON's fields.
 
 The JSON is that of ``transforms*.json`` files without images: intrinsics at the top, overridden frame by frame, and a
 list of camera-to-world matrices, so a data set's own file can be given as a path.
@@ -10,13 +10,15 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from nerfvol.cameras.calibration import Calibration, lens_keys, read_calibration, read_matrix
+from nerfvol.cameras.calibration import Calibration, finite_number, lens_keys, read_calibration, read_matrix
 from nerfvol.cameras.camera import Camera, Intrinsics, orbit, orbit_axes
 from nerfvol.cameras.focus import focus_point
+from nerfvol.cameras.path_files import as_own_document
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json
 
@@ -28,19 +30,36 @@ ONE_SIDE = 120.0
 LARGEST_SIDE = 16384
 
 
+@dataclass(frozen=True)
+class CameraPath:
+    """What a file says: its cameras; loop: the last is followed by the first; keyframes: whether to interpolate between
+    them; fps
+    and seconds: None where it does not say."""
+
+    cameras: list[Camera]
+    loop: bool = False
+    keyframes: bool = False
+    fps: float | None = None
+    seconds: float | None = None
+
+
 def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> list[Camera]:
-    """The cameras of a JSON path, resized to ``size`` (width, height) where given; 800x800 where nobody states one.
+    """The cameras of :func:`load_path`."""
+    return load_path(path, size).cameras
+
+
+def load_path(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> CameraPath:
+    """The camera path in a JSON file of ours or another tool's (path_files.py), resized to ``size`` (width, height) where
+    given;
+    800x800 where nobody states one.
 
     Raises:
         InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
     """
-    document = read_json(path)
-    frames = document.get("frames") if isinstance(document, dict) else None
-    if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: expected a camera path, an object with a non-empty list 'frames'")
+    document = as_own_document(path, read_json(path))
     shared = {key: value for key, value in document.items() if key != "frames"}
     cameras = []
-    for index, frame in enumerate(frames):
+    for index, frame in enumerate(document["frames"]):
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise InputError(f"{path}, frame {index}: expected an object with a transform_matrix")
         try:
@@ -48,7 +67,13 @@ def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = No
         except InputError as error:
             raise InputError(f"{path}, frame {index}: {error}") from error
         cameras.append(camera)
-    return cameras
+    try:
+        timing = {key: finite_number(document, key) for key in ("fps", "seconds")}
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    if bad := [key for key, value in timing.items() if value is not None and value <= 0]:
+        raise InputError(f"{path}: {bad[0]} must be positive, got {timing[bad[0]]:g}")
+    return CameraPath(cameras, document.get("loop") is True, document.get("keyframes") is True, **timing)
 
 
 def _camera(calibration: Calibration, c2w: np.ndarray, size: tuple[int, int] | None) -> Camera:

@@ -44,13 +44,15 @@ def arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--out", metavar="FILE", help="; ".join(
-        f"{' or '.join(s or 'a folder' for s in row.suffixes)}: {row.name} of {' or '.join(row.kinds)}, opened by {row.opened_by}"
-        for row in EXPORTS).replace("%", "%%"))  # fmt: skip
+        f"{' or '.join(s or 'a folder' for s in row.suffixes)}: {row.name} of {' or '.join(row.kinds)}, "
+        f"opened by {row.opened_by}" for row in EXPORTS).replace("%", "%%"))  # fmt: skip
     p.add_argument("--format", metavar="|".join(row.name for row in EXPORTS), help="where an extension serves several "
                    "(default: the first that holds the model)")  # fmt: skip
     p.add_argument("--level", metavar="L", help=f"{_takers('')}: finest level of an octree that is written, 1 or more "
                    "(default: all; vdb: 8)")  # fmt: skip
-    p.add_argument("--max-bytes", metavar="SIZE", help="the same: the finest level whose file is no larger, such as 2MB")
+    p.add_argument(
+        "--max-bytes", metavar="SIZE", help="the same: the finest level whose file is no larger, such as 2MB"
+    )
     p.add_argument("--crop", metavar="X0,Y0,Z0,X1,Y1,Z1", help="only what lies in this box, scene units")
     p.add_argument("--up", metavar="none|+y|-y|+z|…", help=f"{_takers('up')}: axis that the scene's up becomes (default: "
                    "+y for .glb and .obj, none for the others; most splat viewers want -y)")  # fmt: skip
@@ -59,9 +61,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--threshold", metavar="O", help="points: least opacity, of a pixel, a leaf along its side or a splat "
                    "(default: 0.9 of surfaces, 0.5 of centers)")  # fmt: skip
     p.add_argument("--views", metavar="N", help="points, mesh: views that see the surface (default: 40, 60)")
-    p.add_argument("--cameras", metavar="FILE|DATA|sphere", help="points, mesh, transforms, colmap: a camera path, a data set, or "
-                   "a sphere around the model (default: the run's training cameras where its data are there)")  # fmt: skip
-    p.add_argument("--resolution", metavar="N", help="grid, mesh, points: voxels along the longest side (default: 256, 256, 512)")
+    p.add_argument("--cameras", metavar="FILE|DATA|sphere", help="points, mesh, transforms, colmap: a camera path, a data set, "
+                   "or a sphere around the model (default: the run's training cameras where its data are there)")  # fmt: skip
+    p.add_argument(
+        "--resolution", metavar="N", help="grid, mesh, points: voxels along the longest side (default: 256, 256, 512)"
+    )
     p.add_argument("--quantity", metavar="sigma|opacity|color", help="grid: density in 1/scene unit, the opacity of a voxel "
                    "along its side, or colour (default: sigma)")  # fmt: skip
     p.add_argument("--full-float", action="store_true", help="vdb: 32-bit numbers instead of 16-bit")

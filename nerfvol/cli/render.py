@@ -6,13 +6,21 @@ import argparse
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from nerfvol.cli.command import Command, add_drawing, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
-from nerfvol.config.values import Colour, Count, Size, aov_names, fraction, pixels
+from nerfvol.config.values import Colour, Count, Size, above, aov_names, fraction, pixels
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfvol.cameras.camera import Camera
+
+VIDEO_ENDINGS = (".mp4", ".mov", ".webm", ".gif")
+
+FOREIGN = (".avi", ".mkv", ".webp", ".apng", ".jpg", ".jpeg", ".tif", ".tiff", ".exr", ".bmp", ".m4v")
+"""Names of pictures and videos that are not written: what ends so is no folder."""
 
 
 @dataclass
@@ -20,13 +28,19 @@ class RenderOptions:
     """``nerfvol render``."""
 
     target: str = ""
+    path: str | None = None
     cameras: str | None = None
     orbit: Count | None = None
+    frames: Count | None = None
+    seconds: Annotated[float, above(0, 3600)] | None = None
+    loop: bool = False
     size: Size | None = None
     out: str = ""
+    output: Literal["rgb", "depth", "median_depth", "opacity", "normal"] = "rgb"
     aov: Annotated[tuple[str, ...], aov_names] = ()
+    compare: str | None = None
     format: Literal["png", "exr"] = "png"
-    fps: Count = 30
+    fps: Annotated[float, above(0, 240)] | None = None
     background: Colour | None = None
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
     lod: Annotated[float, pixels] = DEFAULT_LOD
@@ -37,13 +51,23 @@ class RenderOptions:
 def arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options to the parser ``p``."""
     add_target(p)
-    p.add_argument("--cameras", metavar="FILE.json", help="camera path: a transforms JSON (docs/cli.md)")
-    p.add_argument("--orbit", metavar="N", help="N views on a circle around the scene, as the training cameras stood")
+    p.add_argument("--path", metavar="orbit|ellipse|spiral|lemniscate|FILE", help="a move around the scene, as the training "
+                   "cameras stood, or a file: our JSON or that of nerfstudio, 3DGS or instant-ngp (docs/cli.md)")  # fmt: skip
+    p.add_argument("--cameras", metavar="FILE.json", help="the same as --path FILE: each camera of the file a picture")
+    p.add_argument("--orbit", metavar="N", help="the same as --path orbit --frames N")
+    p.add_argument("--frames", metavar="N", help="pictures; between the cameras of a file as a smooth path through them "
+                   "(default: 120 of a move, those of a file)")  # fmt: skip
+    p.add_argument("--seconds", metavar="S", help="in place of --frames: N = S x fps")
+    p.add_argument("--fps", metavar="F", help="frames a second of a video (default: what the file says, or 30)")
+    p.add_argument("--loop", action="store_true", help="the path through a file's cameras comes back to the first")
     p.add_argument("--size", metavar="WxH", help="picture size (default: that of the cameras, or 800x800)")
-    p.add_argument("--out", metavar="DIR|FILE.mp4", help="folder for pictures, or a video file")
+    p.add_argument(
+        "--out", metavar="DIR|FILE", help=f"folder for pictures, a video ({', '.join(VIDEO_ENDINGS)}), or one .png"
+    )
+    p.add_argument("--output", metavar="rgb|depth|median_depth|opacity|normal", help="what is shown (default: rgb)")
     p.add_argument("--aov", metavar="LIST", help="also write depth,median_depth,opacity,normal")
+    p.add_argument("--compare", metavar="RUN|FILE", help="a second model, to the right of the first")
     p.add_argument("--format", metavar="png|exr", help="exr: linear float, all AOVs in one file (default: png)")
-    p.add_argument("--fps", metavar="N", help="frames a second of a video (default: 30)")
     p.add_argument("--composite", metavar="surface|over", help="point clouds (.ply without scales): surface: points at one "
                    "depth are averaged first, so that neither gaps nor overlaps show; over: one almost opaque disc or ball "
                    "over the other, as viewers of splats draw them (default: surface)")  # fmt: skip
@@ -57,34 +81,101 @@ def run(options: RenderOptions) -> int:
         InputError: options that do not go together, no such model or camera path, or a path that cannot be written.
     """
     need("render", target=options.target, out=options.out)
-    if (options.cameras is None) == (options.orbit is None):
-        raise InputError("nerfvol render needs either --cameras FILE.json or --orbit N")
-    out = Path(options.out)
-    is_video = out.suffix.lower() == ".mp4"
-    if is_video and options.format == "exr":
-        raise InputError("--format exr writes pictures: give --out a folder, not a video file")
+    _check_path_options(options)
+    out, ending = Path(options.out), _ending(options)
     set_threads(options.threads)
-    from nerfvol.cameras.paths import load_cameras, orbit_cameras
-    from nerfvol.film import Film, write_pictures, write_videos
+    from nerfvol.film import Film, of_one_size, write_picture, write_pictures, write_videos
 
     target = open_target(options.target, options.background)
+    compare = open_target(options.compare, target.background).model if options.compare else None
     if options.composite is not None:
         target = _composited(target, options.composite)
-    if options.cameras is not None:
-        cameras = load_cameras(options.cameras, options.size)
-    else:
-        orbit = target.orbit()
-        if "arc_deg" in orbit:
-            print(f"the training cameras stood on one side: the path sways within their {orbit['arc_deg']:.0f} degrees")
-        cameras = orbit_cameras(options.orbit or 1, orbit, options.size)
-    prepare_outputs(folder=str(out.parent if is_video else out))
-    film = Film(target.model, cameras, target.background, options.aov, options.early_stop_eps, options.lod)
+    cameras, fps = _cameras(options, target)
+    if ending in VIDEO_ENDINGS and len({(c.intrinsics.width, c.intrinsics.height) for c in cameras}) > 1:
+        cameras = of_one_size(cameras)
+        lens = cameras[0].intrinsics
+        print(
+            f"the cameras have several sizes: all are drawn at the first one's, {lens.width}x{lens.height} (or give --size)"
+        )
+    if ending == ".png" and len(cameras) != 1:
+        raise InputError(f"{out} is one picture and there are {len(cameras)} views: give --out a folder or a video")
+    prepare_outputs(folder=str(out.parent if ending else out))
+    film = Film(
+        target.model,
+        cameras,
+        target.background,
+        options.aov,
+        options.early_stop_eps,
+        options.lod,
+        options.output,
+        compare,
+    )
     started = time.perf_counter()
-    written = write_videos(out, film, options.fps) if is_video else write_pictures(out, film, options.format)
+    if ending in VIDEO_ENDINGS:
+        written = write_videos(out, film, fps)
+    else:
+        written = write_picture(out, film) if ending else write_pictures(out, film, options.format)
     seconds = time.perf_counter() - started
     where = ", ".join(map(str, written))
     print(f"{len(cameras)} views in {seconds:.1f} s ({len(cameras) / seconds:.1f} a second): {where}")
     return 0
+
+
+def _check_path_options(options: RenderOptions) -> None:
+    given = [name for name in ("path", "cameras", "orbit") if getattr(options, name) is not None]
+    if not given:
+        raise InputError(
+            "nerfvol render needs --path orbit|ellipse|spiral|lemniscate|FILE (or --cameras FILE.json or --orbit N)"
+        )
+    if len(given) > 1:
+        raise InputError(f"--{given[0]} and --{given[1]} both say where the cameras are: give one of them")
+    if options.frames is not None and options.seconds is not None:
+        raise InputError("--frames and --seconds both say how many pictures there are: give one of them")
+    if options.orbit is not None and (options.frames, options.seconds) != (None, None):
+        raise InputError("--orbit N says how many pictures there are: use --path orbit with --frames or --seconds")
+
+
+def _ending(options: RenderOptions) -> str:
+    """The end of a video's or picture's name, or "" where --out is a folder."""
+    out = Path(options.out)
+    ending = out.suffix.lower()
+    if out.is_dir() or options.out.endswith("/"):
+        return ""
+    if ending in FOREIGN:
+        raise InputError(
+            f"{ending} is not written: expected {', '.join(VIDEO_ENDINGS)}, .png for one view, or a folder"
+        )
+    if ending not in (*VIDEO_ENDINGS, ".png"):
+        return ""
+    if options.format == "exr":
+        raise InputError("--format exr writes pictures: give --out a folder, not a video file or a .png")
+    return ending
+
+
+def _cameras(options: RenderOptions, target: Target) -> tuple[list[Camera], float]:
+    """The cameras that the options name, and the frames a second of a video of them."""
+    from nerfvol.cameras.interpolate import interpolated
+    from nerfvol.cameras.paths import load_path
+    from nerfvol.cameras.shots import MOVES, moving_cameras
+
+    name = options.path or options.cameras or "orbit"
+    if options.cameras is None and name in MOVES and not Path(name).is_file():
+        fps = options.fps or 30.0
+        count = options.orbit or options.frames or round((options.seconds or 0) * fps) or 120
+        orbit = target.orbit()
+        if "arc_deg" in orbit:
+            print(f"the training cameras stood on one side: the path sways within their {orbit['arc_deg']:.0f} degrees")
+        seen = target.training_cameras() if name in ("ellipse", "spiral") else []
+        return moving_cameras(name, count, orbit, options.size, seen), fps
+    if options.cameras is None and not Path(name).exists() and not Path(name).suffix:
+        raise InputError(f"unknown path {name!r}: expected {', '.join(MOVES)}, or a file")
+    path = load_path(name, options.size)
+    fps = options.fps or path.fps or 30.0
+    count = options.frames or (max(1, round(options.seconds * fps)) if options.seconds else None)
+    if count is None and path.keyframes:
+        count = max(1, round((path.seconds or 4.0) * fps))
+    cameras = path.cameras if count is None else interpolated(path.cameras, count, options.loop or path.loop)
+    return cameras, fps
 
 
 def _composited(target: Target, composite: Literal["surface", "over"]) -> Target:
@@ -101,7 +192,8 @@ def _composited(target: Target, composite: Literal["surface", "over"]) -> Target
 
 COMMAND = Command(
     summary="Render pictures or a video along a camera path.",
-    example="nerfvol render run --orbit 120 --out orbit.mp4\n"
+    example="nerfvol render run --path orbit --seconds 4 --out orbit.mp4\n"
+    "nerfvol render run --path path.json --frames 240 --out path.webm --compare other_run\n"
     "nerfvol render run --cameras path.json --out frames --aov depth,normal",
     options=RenderOptions,
     arguments=arguments,

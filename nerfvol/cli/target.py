@@ -13,6 +13,8 @@ from nerfvol.defaults import WHITE
 from nerfvol.files.run_folder import model_path
 
 if TYPE_CHECKING:
+    from nerfvol.cameras.camera import Camera
+    from nerfvol.datasets.dataset import Dataset
     from nerfvol.models import Model
 
 
@@ -32,13 +34,22 @@ class Target:
         stored = self.model.metadata.get("orbit")
         if isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys():
             return stored
-        data = run_settings(self.name).get("data")
-        if data and Path(data).exists():
-            from nerfvol.datasets.load import load_dataset
-
-            dataset = load_dataset(data, "train")
+        if dataset := self._dataset():
             return describe_orbit(dataset.cameras, dataset.scene.aabb)
         return default_orbit(self.model.aabb())
+
+    def training_cameras(self) -> Sequence[Camera]:
+        """Those of the run's data; none where the run says no data or they are gone."""
+        dataset = self._dataset()
+        return [] if dataset is None else dataset.cameras
+
+    def _dataset(self) -> Dataset | None:
+        data = run_settings(self.name).get("data")
+        if not data or not Path(data).exists():
+            return None
+        from nerfvol.datasets.load import load_dataset
+
+        return load_dataset(data, "train")
 
 
 def open_target(name: str, background: Sequence[float] | None = None) -> Target:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Export:
     """name: what ``--format`` calls it; suffixes: ends of file names; module: where ``write`` and ``memory`` are; kinds: models
-    it holds; opened_by: one phrase; options: the names of what ``write`` takes besides model and path; by_name: further kinds that
-    it holds where ``--format`` asks for it; levels: whether an octree may be written at a coarser level."""
+    it holds; opened_by: one phrase; options: the names of what ``write`` takes besides model and path; by_name: further
+    kinds that it holds where ``--format`` asks for it; levels: whether an octree may be written at a coarser level."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -66,7 +66,8 @@ EXPORTS: tuple[Export, ...] = (
         "page", (".html",), "nerfvol.export.page", ALL, "every browser, by a double click", ("max_bytes",), levels=True,
     ),
 )  # fmt: skip
-"""Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another. A row with the suffix ""
+"""Of several rows with one suffix the first that holds the model is taken, unless ``--format`` names another. A row with
+the suffix ""
 writes a folder, and is taken by name alone."""
 
 
@@ -128,9 +129,8 @@ def export_model(
         crop: the box x0, y0, z0, x1, y1, z1, scene units, outside of which nothing is written.
         options: of the writer, by name; those that are None keep their defaults.
 
-    Raises:
-        InputError: see :func:`choose`; an option that the format does not take, nothing in the box, no level whose file is so small,
-            too little memory, a path that cannot be written.
+    Raises: InputError: see :func:`choose`; an option that the format does not take, nothing in the box, no level whose file
+    is so small, too little memory, a path that cannot be written.
     """
     from nerfvol.export.part import part_of
 
@@ -152,7 +152,12 @@ def export_model(
 
 
 def _write(
-    row: Export, model: Model, path: str | os.PathLike[str], place: str | os.PathLike[str], free: int | None, given: dict
+    row: Export,
+    model: Model,
+    path: str | os.PathLike[str],
+    place: str | os.PathLike[str],
+    free: int | None,
+    given: dict,
 ) -> Exported:
     """Writes to ``place``, which is ``path`` or a temporary name of it, once there is memory for it."""
     from nerfvol.machine import available_memory

@@ -1,6 +1,7 @@
 """A folder with a COLMAP model in text, ``cameras.txt``, ``images.txt`` and ``points3D.txt`` (without points), of the cameras.
 
-Poses are world-to-camera, OpenCV axes (x right, y down, z forward), quaternions w first. Cameras of the same intrinsics are one.
+Poses are world-to-camera, OpenCV axes (x right, y down, z forward), quaternions w first. Cameras of the same intrinsics are
+one.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ def write(model: Model, path: str | os.PathLike[str], cameras: Cameras | None = 
     folder = ensure_writable_folder(path)
     files = {
         "cameras.txt": "\n".join(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *lines, ""]),
-        "images.txt": "\n".join(["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then a line of points", *images, ""]),
+        "images.txt": "\n".join(
+            ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then a line of points", *images, ""]
+        ),
         "points3D.txt": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n",
     }
     for name, text in files.items():

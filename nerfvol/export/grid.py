@@ -1,11 +1,13 @@
 """An octree on a dense grid: ``.npz .npy`` (numpy), ``.nii .nii.gz`` (NIfTI-1), ``.vti`` (VTK image data).
 
-Samples are at the centres of cubic voxels of the box around the leaves: density, the opacity of a voxel along its side, or colour
-(the mean over directions, as in the training images; bytes in NIfTI and VTK, which have no other colours). Axes are the scene's.
+Samples are at the centres of cubic voxels of the box around the leaves: density, the opacity of a voxel along its side, or
+colour (the mean over directions, as in the training images; bytes in NIfTI and VTK, which have no other colours). Axes are
+the scene's.
 
-- ``.npz``: ``density`` (``opacity``, ``color``), index order x, y, z, with ``lo``, ``hi`` and ``voxel_size`` (3,), as the density.npz of a
-  synthetic scene; next to an ``.npy`` lies a .json of the same name that says the same.
-- NIfTI-1 (Cox et al. 2004; nifti1.h): x fastest; sform and qform take an index to the voxel's centre in the scene; units are not stated.
+- ``.npz``: ``density`` (``opacity``, ``color``), index order x, y, z, with ``lo``, ``hi`` and ``voxel_size`` (3,), as the
+  density.npz of a synthetic scene; next to an ``.npy`` lies a .json of the same name that says the same.
+- NIfTI-1 (Cox et al. 2004; nifti1.h): x fastest; sform and qform take an index to the voxel's centre in the scene; units
+  are not stated.
 - ``.vti``: point data at the voxels' centres, appended raw.
 """
 
@@ -151,7 +153,8 @@ def _write_vti(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) 
     triple = lambda values: " ".join(repr(float(v)) for v in values)  # noqa: E731
     kind, channels, size = ("UInt8", 3, 1) if quantity == "color" else ("Float32", 1, 4)
     name = _NAMES[quantity]
-    file.write(f"""<?xml version="1.0"?>
+    file.write(
+        f"""<?xml version="1.0"?>
 <VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
 <ImageData WholeExtent="{extent}" Origin="{triple(grid.first)}" Spacing="{triple([grid.voxel] * 3)}">
 <Piece Extent="{extent}">
@@ -161,7 +164,8 @@ def _write_vti(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) 
 </Piece>
 </ImageData>
 <AppendedData encoding="raw">
-_""".encode())
+_""".encode()
+    )
     file.write(struct.pack("<Q", int(np.prod(grid.shape, dtype=object)) * channels * size))
     for part in _numbers(_runs(octree, grid, quantity, "F"), quantity):
         file.write(part)

@@ -1,8 +1,8 @@
 """``.htg``: the octree as it is, as a hyper tree grid of VTK (XML 2.0, appended raw), which ParaView opens and cuts.
 
-Cells carry ``density`` (1/scene unit) and ``color`` (bytes as in the training images); a cell that is refined has the mean of its
-children, so that ParaView's depth limiter shows something. Empty space is masked. Cells are stored breadth first, the children of
-one with x fastest: the bits of our octants, reversed. Layout: VTK 9's vtkXMLHyperTreeGridReader.
+Cells carry ``density`` (1/scene unit) and ``color`` (bytes as in the training images); a cell that is refined has the mean
+of its children, so that ParaView's depth limiter shows something. Empty space is masked. Cells are stored breadth first,
+the children of one with x fastest: the bits of our octants, reversed. Layout: VTK 9's vtkXMLHyperTreeGridReader.
 """
 
 from __future__ import annotations
@@ -101,8 +101,13 @@ def _levels(octree: Octree) -> list[_Level]:
     root = _Level(np.ones(1, bool), np.zeros(1, bool), np.zeros(1), np.zeros((1, 3)))
     levels, nodes = [root], np.zeros(1, np.int64)
     while len(nodes):
-        refined, is_leaf = (bits_of(mask[nodes])[:, X_FASTEST].reshape(-1) for mask in (octree.node_mask, octree.leaf_mask))
-        node, leaf = _children(octree.node_mask, octree.first_node, nodes), _children(octree.leaf_mask, octree.first_leaf, nodes)
+        refined, is_leaf = (
+            bits_of(mask[nodes])[:, X_FASTEST].reshape(-1) for mask in (octree.node_mask, octree.leaf_mask)
+        )
+        node, leaf = (
+            _children(octree.node_mask, octree.first_node, nodes),
+            _children(octree.leaf_mask, octree.first_leaf, nodes),
+        )
         level = _Level(refined, ~(refined | is_leaf), np.zeros(len(refined)), np.zeros((len(refined), 3)))
         level.sigma[is_leaf], level.colour[is_leaf] = sigma[leaf[is_leaf]], colour[leaf[is_leaf]]
         levels.append(level)

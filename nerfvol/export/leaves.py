@@ -1,8 +1,9 @@
 """An octree's leaves as Gaussians, each an isotropic one that stops as much light as the leaf along its side.
 
-Standard deviation 0.4 h of a leaf's side h: 2 pi sigma^2 = h^2, so the optical depth that a leaf's face carries is kept. Opacity
-1 - exp(-sigma_t h); spherical harmonics as in the middle of the leaf. Soft where leaves are smaller than pixels: write the level
-whose leaves are 2 to 6 pixels wide. A low-pass filter of 3DGS that keeps light ("mip") is not what these opacities are for.
+Standard deviation 0.4 h of a leaf's side h: 2 pi sigma^2 = h^2, so the optical depth that a leaf's face carries is kept.
+Opacity 1 - exp(-sigma_t h); spherical harmonics as in the middle of the leaf. Soft where leaves are smaller than pixels:
+write the level whose leaves are 2 to 6 pixels wide. A low-pass filter of 3DGS that keeps light ("mip") is not what these
+opacities are for.
 """
 
 from __future__ import annotations

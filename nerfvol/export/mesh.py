@@ -69,9 +69,11 @@ def _write_obj(path: str | os.PathLike[str], mesh: Mesh) -> int:
         file.write("# nerfvol; colours sRGB\n")
         rows = np.hstack([mesh.vertices, mesh.colours])
         for at in range(0, len(rows), _RUN):
-            file.writelines("v %.6g %.6g %.6g %.4f %.4f %.4f\n" % tuple(row) for row in rows[at : at + _RUN])
+            file.writelines(
+                "v {:.6g} {:.6g} {:.6g} {:.4f} {:.4f} {:.4f}\n".format(*row) for row in rows[at : at + _RUN]
+            )
         for at in range(0, len(mesh.faces), _RUN):
-            file.writelines("f %d %d %d\n" % tuple(face) for face in mesh.faces[at : at + _RUN] + 1)
+            file.writelines("f {} {} {}\n".format(*face) for face in mesh.faces[at : at + _RUN] + 1)
         return file.tell()
 
 

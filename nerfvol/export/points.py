@@ -1,8 +1,9 @@
 """``.ply`` of coloured points: x y z float32, scene units, red green blue bytes as in the training images.
 
-``surface``: what views of the model see, at the median depth of each pixel, one point a voxel, with normals; a point is kept where
-a second view agrees. ``centers``: of an octree the centres of leaves, of splats their means, each with the colour that it shows
-on average over all directions, where it is opaque enough: a leaf along its side, a splat in its middle. A cloud has its points.
+``surface``: what views of the model see, at the median depth of each pixel, one point a voxel, with normals; a point is
+kept where a second view agrees. ``centers``: of an octree the centres of leaves, of splats their means, each with the
+colour that it shows on average over all directions, where it is opaque enough: a leaf along its side, a splat in its
+middle. A cloud has its points.
 """
 
 from __future__ import annotations
@@ -84,18 +85,22 @@ def _surface(model: Model, shots: list[Shot], least: float, resolution: int) -> 
     points, values = np.concatenate(places), np.concatenate(rows)
     if not len(points):
         most = max(float(shot.opacity.max()) for shot in shots)
-        raise InputError(f"nothing that the views see is as opaque as {least:g}, the most is {most:.3g}: lower --threshold")
+        raise InputError(
+            f"nothing that the views see is as opaque as {least:g}, the most is {most:.3g}: lower --threshold"
+        )
     cells = np.floor((points - low) / voxel).astype(np.int64) + 1
     _, cell = np.unique(cells @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)
     count = np.bincount(cell)
     mean = lambda column: np.bincount(cell, column) / count  # noqa: E731
     points = np.stack([mean(points[:, k]) for k in range(3)], axis=1)
     values = np.stack([mean(values[:, k]) for k in range(6)], axis=1)
-    kept = _agreed(shots, points, _AGREE * voxel) >= 2
+    length = np.linalg.norm(values[:, 3:], axis=1)
+    kept = (_agreed(shots, points, _AGREE * voxel) >= 2) & (
+        length > 1e-3
+    )  # a voxel with both sides of a sheet has no normal
     if not kept.any():
         raise InputError("no two views agree on a point of the surface: give more --views")
-    normals = values[kept, 3:]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+    normals = values[kept, 3:] / length[kept, None]
     return PointCloud(points[kept], values[kept, :3].astype(np.float32), normals.astype(np.float32))
 
 

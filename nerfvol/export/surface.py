@@ -76,7 +76,9 @@ def shoot(model: Model, views: int, cameras: Cameras | None, resolution: int) ->
     if cameras is None:
         chosen = _sphere(model, views, min(2 * resolution, _LARGEST_SIDE))
     else:
-        every = np.unique(np.linspace(0, len(cameras.cameras) - 1, min(views, len(cameras.cameras))).round().astype(int))
+        every = np.unique(
+            np.linspace(0, len(cameras.cameras) - 1, min(views, len(cameras.cameras))).round().astype(int)
+        )
         chosen = [_plain(cameras.cameras[i]) for i in every]
     shots = [_shot(model, camera) for camera in chosen]
     if not any((shot.depth > 0).any() for shot in shots):

@@ -30,6 +30,6 @@ def require_cameras(cameras: Cameras | None, format: str) -> Cameras:
     """``cameras``; InputError where there are none."""
     if cameras is None or not len(cameras.cameras):
         raise InputError(
-            f"the format {format} writes cameras, and nothing says which: give --cameras FILE|DATA, or a run whose data are there"
+            f"the format {format} writes cameras, and nothing says which: give --cameras FILE|DATA, or a run with its data"
         )
     return cameras

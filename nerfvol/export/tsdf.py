@@ -1,8 +1,8 @@
 """A surface from views: a truncated signed distance, averaged over them, and its level set (Curless & Levoy 1996).
 
-Distances are along rays, to the median depth; a view counts less the more it grazes. Voxels that no ray of any view reaches in
-front of, or shortly behind, a surface stay unknown, and no triangle is made from them. Marching cubes: scikit-image (Lewiner et al.
-2003), the extra ``nerfvol[mesh]``.
+Distances are along rays, to the median depth; a view counts less the more it grazes. Voxels that no ray of any view reaches
+in front of, or shortly behind, a surface stay unknown, and no triangle is made from them. Marching cubes: scikit-image
+(Lewiner et al. 2003), the extra ``nerfvol[mesh]``.
 """
 
 from __future__ import annotations

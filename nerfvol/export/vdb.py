@@ -1,8 +1,8 @@
 """``.vdb``: the octree's vertices as OpenVDB grids ``density`` (1/scene unit) and ``color`` (vec3s, the mean over directions).
 
-Voxels are the points of the lattice of the finest level that lie in leaves, their corners among them; a coarser leaf is filled by
-its own trilinear values. Programs interpolate trilinearly between voxels, as the leaves do. Around leaves the field ends, a
-lattice fades over one voxel: rims grow by half a voxel. Colours are linear unless ``srgb``.
+Voxels are the points of the lattice of the finest level that lie in leaves, their corners among them; a coarser leaf is
+filled by its own trilinear values. Programs interpolate trilinearly between voxels, as the leaves do. Around leaves the
+field ends, a lattice fades over one voxel: rims grow by half a voxel. Colours are linear unless ``srgb``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ def write(model: Model, path: str | os.PathLike[str], full_float: bool = False, 
     if not srgb:
         colour = srgb_to_linear(colour)
     frame = octree.size / 2.0**level, octree.origin
-    grids = [SparseGrid("density", coords, density, *frame), SparseGrid("color", coords, colour, *frame, kind="unknown")]
+    grids = [
+        SparseGrid("density", coords, density, *frame),
+        SparseGrid("color", coords, colour, *frame, kind="unknown"),
+    ]
     with atomic_write(path) as temporary:
         return write_grids(temporary, grids, half=not full_float)
 

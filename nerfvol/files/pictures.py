@@ -1,4 +1,4 @@
-"""Pictures and videos on disk: 8- and 16-bit PNG, float EXR, MP4. Every file is whole or absent.
+"""Pictures and videos on disk: 8- and 16-bit PNG, float EXR, MP4, MOV, WebM, GIF. Every file is whole or absent.
 
 Colours of a radiance field live in the encoding of its training images (sRGB). A PNG holds them as they are; an EXR
 is linear by convention, so they are decoded with the sRGB curve on the way.
@@ -98,13 +98,25 @@ def _exr_header(names: list[str], width: int, height: int) -> bytes:
     return struct.pack("<ii", 20000630, 2) + b"".join(packed) + b"\0"
 
 
+_H264 = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+_PALETTE = "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer:bayer_scale=4"
+VIDEOS = {
+    ".mp4": _H264,
+    ".mov": _H264,
+    ".webm": ["-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0", "-row-mt", "1", "-pix_fmt", "yuv420p"],
+    ".gif": ["-vf", _PALETTE, "-loop", "0"],
+}
+"""Ends of videos' names, and how ffmpeg encodes them."""
+
+
 class VideoWriter:
-    """Frames to an H.264 MP4 that every browser plays (yuv420p; odd sizes lose their last row or column).
+    """Frames to a video, as the end of its name says: H.264 in an MP4 that every browser plays or in a MOV, VP9 in a WebM
+    (yuv420p; odd sizes lose their last row or column), or a GIF of 256 colours for all frames, which plays for ever.
 
     Speaks to the ffmpeg program itself: it must say that it wrote everything, which imageio's writer does not ask.
     """
 
-    def __init__(self, path: Path, fps: int):
+    def __init__(self, path: Path, fps: float):
         self._path, self._fps = path, fps
         self._process: subprocess.Popen[bytes] | None = None
         self._size = (0, 0)
@@ -152,7 +164,7 @@ class VideoWriter:
         import imageio_ffmpeg
 
         frames = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(self._fps), "-i", "-"]
-        video = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(self._path)]
+        video = [*VIDEOS[self._path.suffix.lower()], str(self._path)]
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", *frames, *video]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
@@ -176,7 +188,7 @@ class VideoWriter:
 
 
 @contextlib.contextmanager
-def open_video(path: str | os.PathLike[str], fps: int) -> Iterator[VideoWriter]:
+def open_video(path: str | os.PathLike[str], fps: float) -> Iterator[VideoWriter]:
     """A :class:`VideoWriter` whose file appears at ``path`` when the block ends without an exception."""
     with atomic_write(path) as temporary:
         writer = VideoWriter(temporary, fps)

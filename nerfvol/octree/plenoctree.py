@@ -1,9 +1,10 @@
 """PlenOctrees: the ``.npz`` of svox and volrend (Yu et al. 2021), both ways.
 
-A node is 2x2x2 cells along x, y, z; ``child`` (n, 2, 2, 2) int32 says how many nodes further on the one inside a cell is, 0: the cell is a
-leaf. ``data`` (n, 2, 2, 2, 3 K + 1) float16: K coefficients each of red, green and blue, whose colour is sigmoid(sum_k Y_k), then
-density in 1/scene unit, constant in the cell. A point x lies at ``offset`` + x * ``invradius3`` in the root's unit cube. Ours is
-trilinear between vertices with colours 1/2 + sum_k Y_k: either way colours are fitted over 64 directions.
+A node is 2x2x2 cells along x, y, z; ``child`` (n, 2, 2, 2) int32 says how many nodes further on the one inside a cell is,
+0: the cell is a leaf. ``data`` (n, 2, 2, 2, 3 K + 1) float16: K coefficients each of red, green and blue, whose colour is
+sigmoid(sum_k Y_k), then density in 1/scene unit, constant in the cell. A point x lies at ``offset`` + x * ``invradius3`` in
+the root's unit cube. Ours is trilinear between vertices with colours 1/2 + sum_k Y_k: either way colours are fitted over 64
+directions.
 """
 
 from __future__ import annotations
@@ -110,7 +111,9 @@ def load_plenoctree(path: str | os.PathLike[str]) -> Octree:
         raise fault(f"its data_format is {kind[:40]!r}, expected SH1, SH4, SH9 or SH16")
     n, channels = len(child), 3 * (degree + 1) ** 2 + 1
     if not n or child.shape != (n, 2, 2, 2) or data.shape != (n, 2, 2, 2, channels):
-        raise fault(f"child and data have shapes {child.shape} and {data.shape}, expected (n, 2, 2, 2) and {channels} numbers a cell")
+        raise fault(
+            f"child and data have shapes {child.shape} and {data.shape}, expected (n, 2, 2, 2) and {channels} numbers a cell"
+        )
     scale = np.broadcast_to(np.ravel(arrays["invradius3"]).astype(np.float64), 3)
     offset = np.broadcast_to(np.ravel(arrays["offset"]).astype(np.float64), 3)
     if not (np.isfinite(offset).all() and scale.min() > 0 and np.ptp(scale) <= 1e-3 * scale.max()):
@@ -153,7 +156,9 @@ def _read(path: str | os.PathLike[str]) -> Mapping[str, NDArray[Any]]:
     except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} is not a usable PlenOctree: {(str(error).splitlines() or ['it is damaged'])[0]}") from error
+        raise InputError(
+            f"{path} is not a usable PlenOctree: {(str(error).splitlines() or ['it is damaged'])[0]}"
+        ) from error
     if any(found[name].dtype.kind not in "iuf" for name in ("child", "data", "offset", "invradius3")):
         raise InputError(f"{path} is not a usable PlenOctree: its arrays should hold numbers")
     return {**found, "child": found["child"][:used], "data": found["data"][:used]}

@@ -31,8 +31,8 @@ def turned(splats: Splats, rotation: Float) -> Splats:
 def sh_rotation(degree: int, rotation: Float) -> Float:
     """(K, K), K = (degree + 1)**2: the coefficients of a function in turned axes from those before.
 
-    Each band turns into itself: f'(R d) = f(d) for the function's values along directions that are many and spread enough to tell
-    its coefficients (a Fibonacci lattice), by least squares, exact to rounding.
+    Each band turns into itself: f'(R d) = f(d) for the function's values along directions that are many and spread enough
+    to tell its coefficients (a Fibonacci lattice), by least squares, exact to rounding.
     """
     n = 16 * basis_dim(degree)
     z = 1 - (2 * np.arange(n) + 1) / n

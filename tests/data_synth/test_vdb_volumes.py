@@ -50,7 +50,10 @@ def test_sparse_grids_far_apart_and_below_zero(tmp_path, half):
     coords = np.unique(rng.integers(-60, 60, (4000, 3)) + rng.choice([-130, 0, 140], (4000, 3)), axis=0)
     rng.shuffle(coords)
     numbers, vectors = (rng.uniform(-2, 2, (len(coords), *more)).astype(np.float32) for more in ((), (3,)))
-    grids = [SparseGrid("density", coords, numbers, 0.5, (1, 2, 3)), SparseGrid("color", coords, vectors, kind="unknown")]
+    grids = [
+        SparseGrid("density", coords, numbers, 0.5, (1, 2, 3)),
+        SparseGrid("color", coords, vectors, kind="unknown"),
+    ]
     assert write_grids(tmp_path / "a.vdb", grids, half) == (tmp_path / "a.vdb").stat().st_size
     for name, wanted in (("density", numbers), ("color", vectors)):
         grid = read_vdb(tmp_path / "a.vdb", name)

@@ -40,17 +40,24 @@ def test_refusals_follow_from_the_rows(monkeypatch):
         Export("splats", (".ply",), "m", ("splats",), "viewers"),
         Export("points", (".ply",), "m", ("octree", "splats"), "Blender", ("threshold",)),
         Export("grid", (".npz",), "m", ("octree",), "numpy"),
+        Export("leaves", (".ply", ".vol.gz"), "m", ("splats",), "viewers", (), ("octree",)),
+        Export("model", ("",), "m", ("octree",), "COLMAP"),
     )
     monkeypatch.setattr(export, "EXPORTS", rows)
     assert choose("a.PLY", "splats").name == "splats" and choose("a.ply", "octree").name == "points"
     assert choose("a.ply", "splats", "points").name == "points"
-    with pytest.raises(InputError, match=r"holds splats, this is a model of octree, .*--representation splats"):
+    with pytest.raises(InputError, match=r"holds splats, this is a model of octree, which goes to \.npz"):
         choose("a.ply", "octree", "splats")
     with pytest.raises(
-        InputError, match=r"\.npz \(grid\) holds octree, .* goes to \.ply \(points\) or \.ply \(splats\)"
+        InputError,
+        match=r"\.npz \(grid\) holds octree, .* goes to \.ply \(leaves\), \.ply \(points\), \.ply \(splats\) or",
     ):
         choose("a.npz", "splats")
-    with pytest.raises(InputError, match="format grid is not written to .ply, which is for splats or points"):
+    assert choose("a.ply", "octree", "leaves").name == "leaves"  # by name alone
+    assert choose("A.VOL.gz", "splats").name == "leaves" and choose("folder", "octree", "model").name == "model"
+    with pytest.raises(InputError, match="unknown extension .gz: expected .npz, .ply or .vol.gz"):
+        choose("a.nii.gz", "octree")
+    with pytest.raises(InputError, match="format grid is not written to .ply, which is for splats, points or leaves"):
         choose("a.ply", "octree", "grid")
     with pytest.raises(InputError, match="unknown format 'mesh'"):
         choose("a.ply", "octree", "mesh")

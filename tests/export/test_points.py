@@ -21,7 +21,7 @@ def read(path):
 
 
 def test_leaves_of_an_octree(tmp_path, sphere_octree):
-    size = export_model(OctreeModel(sphere_octree), tmp_path / "p.ply", threshold=0.3)[1]
+    size = export_model(OctreeModel(sphere_octree), tmp_path / "p.ply", method="centers", threshold=0.3)[1]
     points = read(tmp_path / "p.ply")
     assert size == (tmp_path / "p.ply").stat().st_size and 500 < len(points) < sphere_octree.n_leaves
     radius = np.linalg.norm(points["place"], axis=1)
@@ -33,7 +33,7 @@ def test_leaves_of_an_octree(tmp_path, sphere_octree):
 
 def test_means_of_splats(tmp_path):
     splats = random_splats(200, 4, 3)
-    export_model(SplatModel(splats), tmp_path / "p.ply", "points", threshold=0.6)
+    export_model(SplatModel(splats), tmp_path / "p.ply", "points", method="centers", threshold=0.6)
     points, shown = read(tmp_path / "p.ply"), 1 / (1 + np.exp(-splats.logits)) >= 0.6
     assert np.allclose(points["place"], (splats.means + splats.origin)[shown], atol=1e-5)
     wanted = np.clip(0.5 + 0.28209479 * splats.sh[shown, :, 0], 0, 1)
@@ -44,5 +44,5 @@ def test_nothing_so_opaque(tmp_path):
     splats = random_splats(20, 1, 3)
     splats.logits[:] = -2
     with pytest.raises(InputError, match="nothing is as opaque as 0.5, the most is 0.119: lower --threshold"):
-        export_model(SplatModel(splats), tmp_path / "p.ply", "points")
+        export_model(SplatModel(splats), tmp_path / "p.ply", "points", method="centers")
     assert not list(tmp_path.iterdir())
