@@ -49,7 +49,9 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: 1)")
     p.add_argument("--json", metavar="FILE", help="write scores, per-image rows, seconds per frame and hardware")
     p.add_argument("--save-images", metavar="DIR", help="write truth | render | error | depth for every view")
-    p.add_argument("--lpips", action="store_true", help="also score LPIPS (VGG); needs nerfvol[lpips] and some seconds a view")
+    p.add_argument(
+        "--lpips", action="store_true", help="also score LPIPS (VGG); needs nerfvol[lpips] and some seconds a view"
+    )
     p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
                    "(with --save-images: slices of both)")  # fmt: skip
     add_drawing(p)
@@ -161,7 +163,9 @@ def _print_scores(record: dict[str, Any], split: str) -> None:
     width = max(len(row["name"]) for row in record["rows"])
     for row in record["rows"]:
         distance = f"  lpips {row['lpips']:.4f}" if "lpips" in row else ""
-        print(f"{row['name']:{width}s}  {row['psnr']:6.2f} dB  ssim {row['ssim']:.4f}{distance}  {row['seconds']:.3f} s")
+        print(
+            f"{row['name']:{width}s}  {row['psnr']:6.2f} dB  ssim {row['ssim']:.4f}{distance}  {row['seconds']:.3f} s"
+        )
     size = "x".join(map(str, record["image_size"]))
     background = ",".join(f"{component:g}" for component in record["background"])
     distance = f", LPIPS {record['lpips']:.4f} ({record['lpips_network']})" if "lpips" in record else ""

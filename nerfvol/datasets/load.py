@@ -54,7 +54,9 @@ def load_dataset(
     if holdout not in HOLDOUTS:
         raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
     reader = find_format(Path(path)).reader
-    listing = reader.read(Path(path), split) if holdout == "own" else _without_arc(reader.read(Path(path), "train"), split)
+    listing = (
+        reader.read(Path(path), split) if holdout == "own" else _without_arc(reader.read(Path(path), "train"), split)
+    )
     messages = list(listing.messages)
     frames = _present(listing, messages)
     sizes = map_threads(lambda frame: image_size(frame.file), frames, threads)

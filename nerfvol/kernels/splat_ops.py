@@ -88,9 +88,7 @@ def render_points(
     return _draw(packed, view, bg, eps, outputs, surfaces=True)
 
 
-def _checked(
-    background: Sequence[float], early_stop_eps: float, outputs: Sequence[str]
-) -> tuple[list[float], float]:
+def _checked(background: Sequence[float], early_stop_eps: float, outputs: Sequence[str]) -> tuple[list[float], float]:
     """Background and threshold as the kernels take them; ValueError where they or the outputs' names are wrong."""
     check_outputs(outputs)
     return check_background(background), check_early_stop(early_stop_eps)

@@ -48,7 +48,9 @@ def load_lpips() -> Callable[[NDArray[np.floating], NDArray[np.floating]], float
                 f"LPIPS compares RGB images of one size, at least {SMALLEST}x{SMALLEST}, got shapes {shape} and "
                 f"{np.shape(reference)}"
             )
-        a, b = (torch.from_numpy(np.ascontiguousarray(x, np.float32)).permute(2, 0, 1)[None] for x in (image, reference))
+        a, b = (
+            torch.from_numpy(np.ascontiguousarray(x, np.float32)).permute(2, 0, 1)[None] for x in (image, reference)
+        )
         with torch.no_grad():
             return float(network(a, b, normalize=True))
 

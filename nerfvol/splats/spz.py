@@ -117,7 +117,7 @@ def load_spz(path: str | os.PathLike[str]) -> Splats:
 
 
 def _half_a_turn(splats: Splats) -> Splats:
-    """The splats turned by 180 degrees about the x axis: y and z change signs, and so do harmonics that are odd in both together."""
+    """The splats turned by 180 degrees about the x axis: y and z change signs, and harmonics odd in the two together."""
     turn = np.array([1.0, -1.0, -1.0])
     # Of y, z, x; xy, yz, zz, xz, xx - yy; y(..), xyz, y(..), z(..), x(..), z(..), x(..).
     signs = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
@@ -166,7 +166,9 @@ def _require_memory(path: Path, count: int, degree: int) -> None:
     """Refuses Gaussians that do not fit: the library's arrays, ours and a copy of them."""
     need, have = 3 * 4 * count * (11 + 3 * (degree + 1) ** 2), total_memory()
     if have is not None and need > 0.8 * have:
-        raise _fault(path, f"its {count} Gaussians need {need / 2**30:.1f} GiB, and there are {have / 2**30:.1f} GiB of memory")
+        raise _fault(
+            path, f"its {count} Gaussians need {need / 2**30:.1f} GiB, and there are {have / 2**30:.1f} GiB of memory"
+        )
 
 
 def _check_gzip(path: Path, file: BinaryIO, wanted: int) -> None:
