@@ -123,7 +123,7 @@ def _half_a_turn(splats: Splats) -> Splats:
     signs = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
     return replace(
         splats, means=(splats.means * turn).astype(np.float32), origin=splats.origin * turn,
-        quats=splats.quats * np.float32([1, 1, -1, -1]), sh=splats.sh * signs[: splats.sh.shape[2]],
+        quats=splats.quats * np.array([1, 1, -1, -1], np.float32), sh=splats.sh * signs[: splats.sh.shape[2]],
     )  # fmt: skip
 
 
