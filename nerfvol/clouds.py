@@ -44,7 +44,8 @@ class PointModel:
     def __init__(
         self, cloud: PointCloud, metadata: Mapping[str, Any] | None = None, composite: Composite = "surface"
     ) -> None:
-        self.cloud, self.metadata, self.composite = cloud, dict(metadata or {}), composite
+        self.cloud, self.metadata = cloud, dict(metadata or {})
+        self.composite: Composite = composite
         self._model = SplatModel(splats_of_points(cloud, _SCALES[composite]), metadata)
 
     @property

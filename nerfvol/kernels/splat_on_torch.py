@@ -78,7 +78,9 @@ def adam_step(state: SplatState, g: np.ndarray, hit: np.ndarray, rates: SplatRat
     new_value = value - step
     if rates.most_log_ratio:
         scales = new_value[:, packing.LOG_SCALES]
-        new_value[:, packing.LOG_SCALES] = np.minimum(scales, np.median(scales, 1, keepdims=True) + rates.most_log_ratio)
+        new_value[:, packing.LOG_SCALES] = np.minimum(
+            scales, np.median(scales, 1, keepdims=True) + rates.most_log_ratio
+        )
     fill = packing.padding(g.shape[1])
     for blocks, old, new in ((state.params, value, new_value), (state.first, first, m), (state.second, second, v)):
         rows = np.where(hit[:, None], new, old).astype(np.float32)

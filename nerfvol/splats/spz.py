@@ -117,13 +117,13 @@ def load_spz(path: str | os.PathLike[str]) -> Splats:
 
 
 def _half_a_turn(splats: Splats) -> Splats:
-    """The splats turned by 180 degrees about the x axis: y and z change signs, and so do harmonics that are odd in both together."""
+    """The splats turned by 180 degrees about the x axis: y and z change signs, and harmonics odd in the two together."""
     turn = np.array([1.0, -1.0, -1.0])
     # Of y, z, x; xy, yz, zz, xz, xx - yy; y(..), xyz, y(..), z(..), x(..), z(..), x(..).
     signs = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
     return replace(
         splats, means=(splats.means * turn).astype(np.float32), origin=splats.origin * turn,
-        quats=splats.quats * np.float32([1, 1, -1, -1]), sh=splats.sh * signs[: splats.sh.shape[2]],
+        quats=splats.quats * np.array([1, 1, -1, -1], np.float32), sh=splats.sh * signs[: splats.sh.shape[2]],
     )  # fmt: skip
 
 
