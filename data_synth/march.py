@@ -29,7 +29,15 @@ from data_synth.spongecake import attenuation
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, dot, largest, mean, mul, neg, scale, sub
 from data_synth.world import (
-    MARCHED, SURFACES, crossing, index_at, inside_at, medium_of, next_surface, number_at, visible,
+    MARCHED,
+    SURFACES,
+    crossing,
+    index_at,
+    inside_at,
+    medium_of,
+    next_surface,
+    number_at,
+    visible,
 )  # fmt: skip
 
 BY_RAYS, MAPPED, PREVIEW, UNLIT, GATHERED = range(5)
