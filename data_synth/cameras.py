@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth.checks import vector
 from data_synth.errors import InputError
 from data_synth.jit import jit
 
@@ -102,6 +103,16 @@ class Viewpoints:
     radius: float = 4.0
     elevation: tuple[float, float] = (5.0, 75.0)
     fov: float = 40.0
+
+    def __post_init__(self) -> None:
+        vector(self.target, "viewpoints: target")
+        vector((self.radius, *self.elevation), "viewpoints: radius and two elevations")
+        low, high = self.elevation
+        if not self.radius > 0 or not 0 < self.fov < 180 or not -90 < low <= high < 90:
+            raise InputError(
+                "viewpoints: expected a positive radius, elevations within (-90, 90) and fov within (0, 180), "
+                f"got {self.radius}, {self.elevation} and {self.fov}"
+            )
 
     def camera(self, azimuth: float, elevation: float, width: int, height: int) -> Camera:
         """The camera at the given angles in degrees."""

@@ -6,36 +6,64 @@ import argparse
 import ast
 import sys
 import time
+import warnings
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
-from data_synth import integrators, scenes
+from data_synth import integrators, scene_file, scenes
 from data_synth.dataset import Options, Renderable, render_view, write_dataset
-from data_synth.errors import InputError
+from data_synth.errors import InputError, RenderWarning
 from data_synth.image import write_png
 from data_synth.integrators import Integrator
+from data_synth.jit import say_when_compiling
+from data_synth.scene import Scene
+
+OWN = {key: "--" + key.replace("_", "-") for key in ("spp", "max_depth", "beams", "side", "resolution", "fill")}
 
 
-def parser() -> argparse.ArgumentParser:
+class _Parser(argparse.ArgumentParser):
+    """argparse whose complaints are one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
+
+
+def parser(details: str = "") -> argparse.ArgumentParser:
     """The options of ``synth``."""
-    p = argparse.ArgumentParser(
+    p = _Parser(
         prog="nerfvol synth",
         description="Render a scene with a known truth to posed images in the NeRF-synthetic layout.",
+        epilog=details or "nerfvol synth SCENE --help tells the parameters of a scene.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("scene", metavar="SCENE", help="a scene by name, 'list' for all of them, or 'bench' [one|sky|...]")
+    what = "a scene by name, a scene file (.yaml), 'list' for all scenes, or 'bench' [one|sky|...]"
+    p.add_argument("scene", metavar="SCENE", help=what)
     p.add_argument("--out", metavar="DIR", help="folder to write (made if it is not there)")
     p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png with a backdrop")
-    p.add_argument("--views", type=int, default=60, help="training views; val and test are added (default 60)")
+    p.add_argument(
+        "--views", type=int, default=60, metavar="N", help="training views; val and test are added (default 60)"
+    )
     p.add_argument("--size", default="400x400", metavar="WxH", help="pixels of every view (default 400x400)")
-    p.add_argument("--seed", type=int, default=0, help="seed of camera places and of Monte Carlo (default 0)")
+    p.add_argument("--fov", type=float, metavar="DEGREES", help="horizontal field of view instead of the scene's own")
+    p.add_argument("--exposure", type=float, metavar="X", help="factor of colours on their way to 8 bits")
+    p.add_argument("--seed", type=int, default=0, metavar="N", help="of camera places and of Monte Carlo (default 0)")
     p.add_argument("--integrator", metavar="NAME", help="how to render; by default the scene's own choice")
-    p.add_argument("--spp", type=int, metavar="N", help="samples per pixel of Monte Carlo integrators")
+    p.add_argument("--spp", type=int, metavar="N", help="path: samples per pixel")
+    p.add_argument("--max-depth", type=int, metavar="N", help="path: most scattering events (default: no limit)")
+    p.add_argument("--step", type=float, metavar="U", help="march, deep: length of a step in scene units")
+    p.add_argument("--side", type=int, metavar="N", help="march, deep: N x N rays per pixel (default 1)")
+    p.add_argument("--beams", type=int, metavar="N", help="march, deep: beams that stand for a sky or lamp")
+    p.add_argument("--resolution", type=int, metavar="N", help="deep: samples along the longest side of a shadow map")
+    p.add_argument("--fill", metavar="HOW", help="deep: sweep, eager or lazy")
     lights = ", ".join(scenes.LIGHTS)
     p.add_argument("--light", metavar="NAME,...", help=f"lights instead of the scene's own: {lights}")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a parameter of the scene")
-    p.add_argument("--volume", metavar="FILE", help="a density volume (.vdb or .npz) for scenes that take one")
+    p.add_argument(
+        "--volume", metavar="FILE", help="a density volume (.vdb, .vdb:GRID, .npz, .raw) for scenes that take one"
+    )
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
     return p
 
@@ -43,21 +71,50 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str]) -> int:
     """Run ``synth`` with the arguments after the word; the exit code. Bad input is one sentence and code 2."""
     try:
-        if argv[:1] == ["bench"]:
-            from data_synth.bench import main as bench
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", RenderWarning)
+            warnings.showwarning = lambda message, *_: print(f"nerfvol synth: {message}", file=sys.stderr)
+            if argv[:1] == ["bench"]:
+                from data_synth.bench import main as bench
 
-            return bench(argv[1:])
-        args = parser().parse_args(argv)
-        return _list() if args.scene == "list" else _render(args)
+                return bench(argv[1:])
+            args = parser(_details(argv)).parse_args(argv)
+            if args.scene == "list":
+                return _list(argv)
+            with say_when_compiling():
+                return _render(args)
     except InputError as error:
         print(f"nerfvol synth: {error}", file=sys.stderr)
         return 2
 
 
-def _list() -> int:
+def _list(argv: list[str]) -> int:
+    if len(argv) > 1:
+        raise InputError(f"list: expected nothing else, got {' '.join(a for a in argv if a != 'list')}")
     for name in scenes.SCENES:
         print(f"{name:14s} {scenes.summary(name)}  [docs/gallery/{name}.jpg]")
     return 0
+
+
+def _details(argv: list[str]) -> str:
+    """What --help says of a scene."""
+    name = next((word for word in argv if word in scenes.SCENES), None)
+    if name is None or not {"-h", "--help"} & set(argv):
+        return ""
+    parameters = scenes.parameters_of(name)
+    lines = [f"{name}: {scenes.summary(name)}", "", "parameters, with their defaults:"]
+    for key, default in parameters.items():
+        option = "--volume FILE" if key == "volume" else f"--set {key}={default}"
+        lines.append(f"  {option:28s}" + (" a density volume instead of the scene's own" if key == "volume" else ""))
+    if not parameters:
+        lines.append("  none")
+    own = ("emission",) if name == "showcase" else scenes.make(name, **_smallest(parameters)).integrators
+    return "\n".join([*lines, "", f"integrators, its own choice first: {', '.join(own)}"])
+
+
+def _smallest(parameters: dict[str, Any]) -> dict[str, Any]:
+    """Parameters that make the scene in no time, to ask it something."""
+    return {"resolution": 16} if "resolution" in parameters else {}
 
 
 def _parameters(args: argparse.Namespace) -> dict[str, Any]:
@@ -68,12 +125,14 @@ def _parameters(args: argparse.Namespace) -> dict[str, Any]:
             raise InputError(f"--set: expected KEY=VALUE, got '{item}'")
         try:
             parameters[key] = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
+        except (ValueError, SyntaxError, MemoryError, RecursionError):
             parameters[key] = value
-    if args.volume:
-        parameters["volume"] = args.volume
-    if args.light:
-        parameters["light"] = args.light
+    for key in ("volume", "light"):
+        given = getattr(args, key)
+        if given is not None:
+            if not given:
+                raise InputError(f"--{key}: expected a name, got nothing")
+            parameters[key] = given
     return parameters
 
 
@@ -84,38 +143,70 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _render(args: argparse.Namespace) -> int:
-    if not args.out and not args.picture:
-        raise InputError("--out: expected a folder to write, got nothing")
-    started = time.perf_counter()
-    size = _size(args.size)
-    scene = scenes.make(args.scene, **_parameters(args))
-    name = args.integrator or scene.integrators[0]
-    if args.integrator and args.integrator not in scene.integrators:
-        known = ", ".join(scene.integrators)
-        raise InputError(f"--integrator: scene {scene.name} takes {known}, got {args.integrator}")
-    if args.spp is not None and name != "path":
-        raise InputError(f"--spp: only the path integrator has samples, {scene.name} is rendered by {name}")
-    integrator = None if args.scene == "showcase" else integrators.make(name, spp=args.spp)
+def _scene(args: argparse.Namespace) -> Renderable:
+    """The scene with what the command line changes of it."""
+    if args.scene.endswith((".yaml", ".yml")):
+        if args.set or args.volume or args.light:
+            raise InputError("--set, --volume, --light: a scene file says these itself, expected none of them")
+        scene: Renderable = scene_file.load(args.scene)
+    else:
+        scene = scenes.make(args.scene, **_parameters(args))
+    if args.fov is not None:
+        if not 0 < args.fov < 180:
+            raise InputError(f"--fov: expected degrees between 0 and 180, got {args.fov:g}")
+        scene.viewpoints = replace(scene.viewpoints, fov=args.fov)
+    if args.exposure is not None:
+        if not 0 < args.exposure < np.inf:
+            raise InputError(f"--exposure: expected a positive number, got {args.exposure:g}")
+        scene.exposure = args.exposure
+    if args.step is not None:
+        if not 0 < args.step < np.inf:
+            raise InputError(f"--step: expected a positive length, got {args.step:g}")
+        if not isinstance(scene, Scene) or scene.medium is None:
+            raise InputError(f"--step: {scene.name} has no medium to march through")
+        scene.medium = scene.medium._replace(step=args.step)
+        scene.media = [m._replace(step=args.step) for m in scene.media]
+    return scene
 
+
+def _integrator(args: argparse.Namespace, scene: Renderable) -> Integrator | None:
+    """The integrator that the options ask for; None for scenes that render themselves."""
+    name = args.integrator or scene.integrators[0]
+    if name not in scene.integrators:
+        raise InputError(f"--integrator: scene {scene.name} takes {', '.join(scene.integrators)}, got {name}")
+    given = {key: getattr(args, key) for key in OWN if getattr(args, key) is not None}
+    known = integrators.options(name) if isinstance(scene, Scene) else set()
+    for key in given:
+        if key not in known:
+            raise InputError(f"{OWN[key]}: expected an integrator that has it, {scene.name} is rendered by {name}")
+    return integrators.make(name, **given) if isinstance(scene, Scene) else None
+
+
+def _render(args: argparse.Namespace) -> int:
+    if bool(args.out) == bool(args.picture):
+        got = "both" if args.out else "nothing"
+        raise InputError(f"--out, --picture: expected a folder to write or one portrait, got {got}")
+    started = time.perf_counter()
+    options = Options(args.views, _size(args.size), args.seed, None, args.exr)
+    if args.picture and (Path(args.picture).suffix not in (".jpg", ".png") or not Path(args.picture).parent.is_dir()):
+        raise InputError(f"--picture: expected a .jpg or .png in a folder that exists, got {args.picture}")
+    scene = _scene(args)
+    integrator = _integrator(args, scene)
     if args.picture:
-        return _portrait(scene, integrator, size, args)
+        return _portrait(scene, integrator, options.size, args)
 
     def progress(done: int, total: int) -> None:
         if sys.stderr.isatty():
             end = "\n" if done == total else ""
             print(f"\r{scene.name}: view {done}/{total}", end=end, file=sys.stderr, flush=True)
 
-    options = Options(args.views, size, args.seed, integrator, args.exr, progress)
-    out = write_dataset(scene, args.out, options)
+    out = write_dataset(scene, args.out, replace(options, integrator=integrator, progress=progress))
     print(f"{out}: {args.views} training views of {scene.name} in {time.perf_counter() - started:.1f} s")
     return 0
 
 
 def _portrait(scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace) -> int:
     """One view from the middle of the scene's viewing band, over a pale backdrop that darkens downwards."""
-    if Path(args.picture).suffix not in (".jpg", ".png"):
-        raise InputError(f"--picture: expected a name that ends in .jpg or .png, got {args.picture}")
     started = time.perf_counter()
     camera = scene.viewpoints.camera(-55.0, 0.5 * sum(scene.viewpoints.elevation) - 5.0, *size)
     rgba = render_view(scene, camera, integrator, args.seed).rgba8(scene.exposure) / 255.0

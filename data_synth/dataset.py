@@ -42,6 +42,8 @@ class Options:
     def __post_init__(self) -> None:
         if self.views < 1:
             raise InputError(f"--views: expected at least 1, got {self.views}")
+        if self.seed < 0:
+            raise InputError(f"--seed: expected a whole number from 0 on, got {self.seed}")
         if min(self.size) < 1 or max(self.size) > 16384:
             raise InputError(f"--size: expected 1 to 16384 pixels a side, got {self.size[0]}x{self.size[1]}")
 

@@ -14,7 +14,7 @@ from data_synth.jit import jit
 from data_synth.lights import POINT, column3
 from data_synth.media import attribute, extinction, lookup
 from data_synth.rng import uniform
-from data_synth.transmittance import shadow_transmittance
+from data_synth.trackers import shadow_transmittance
 from data_synth.vec import along, dot, extent, largest, mul, neg, scale, sub
 from data_synth.world import RANDOM, visible
 

@@ -180,7 +180,7 @@ def trilinear(v, a, fu, fv, fw):
 
 @jit
 def look_up(m, v, p):
-    """(rho, J rgb) at a point: ``media.trilinear`` of four numbers at a time."""
+    """(rho, J rgb) at a point: ``media.interpolated`` of four numbers at a time."""
     a, fu, fv, fw = place(m, p)
     return trilinear(v, a, fu, fv, fw)
 

@@ -12,8 +12,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
@@ -47,6 +47,11 @@ class March:
     beams: int = 12
     side: int = 1
     mode: int = field(default=march.BY_RAYS, repr=False)
+
+    def __post_init__(self) -> None:
+        for name, value, high in (("--beams", self.beams, 100_000), ("--side", self.side, 64)):
+            if not 1 <= value <= high:
+                raise InputError(f"{name}: expected a whole number from 1 to {high}, got {value}")
 
     def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
         return shadowmap.none(), None
@@ -98,6 +103,13 @@ class DeepShadow(March):
     fill: str = "sweep"
     mode: int = field(default=march.MAPPED, repr=False)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.fill not in ("sweep", "eager", "lazy"):
+            raise InputError(f"--fill: expected sweep, eager or lazy, got '{self.fill}'")
+        if self.resolution is not None and not 2 <= self.resolution <= 1024:
+            raise InputError(f"--resolution: expected a whole number from 2 to 1024, got {self.resolution}")
+
     def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
         together = self.resolution is None and self.fill == "sweep" and gather.possible(world)
         if together and not has_surfaces(world):
@@ -140,6 +152,11 @@ class Path:
 INTEGRATORS: dict[str, Callable[..., Integrator]] = {
     "emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview,
 }  # fmt: skip
+
+
+def options(name: str) -> set[str]:
+    """What can be chosen of an integrator."""
+    return {f.name for f in fields(cast(Any, INTEGRATORS[name])) if f.repr}
 
 
 def make(name: str, **options: object) -> Integrator:

@@ -11,11 +11,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 import numba
+from numba.core import event
 
 # error_model="numpy": x/0 is inf as in IEEE 754, no exception branch behind every division.
 # _nrt=False: no array is ever made inside compiled code, so none needs its references counted. Counting them, with
@@ -26,7 +31,7 @@ jit = numba.njit(**OPTIONS)
 
 def _sources_stamp() -> str:
     """A digest of the package's compiled sources."""
-    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py"))]
+    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")) if path != Path(__file__)]
     return hashlib.sha256(b"".join(t for t in texts if b"@jit" in t or b"@kernel" in t)).hexdigest()
 
 
@@ -44,6 +49,30 @@ def kernel(function: Callable) -> Callable:
     if index is not None and hasattr(index, "_source_stamp"):
         index._source_stamp = _STAMP
     return compiled
+
+
+@contextmanager
+def say_when_compiling(stream: TextIO | None = None) -> Iterator[None]:
+    """Say on ``stream`` (stderr) that code is being compiled, once, and how long that took.
+
+    Nothing is said where the machine code is found in the cache.
+    """
+    spoken: list[float] = []
+    out = stream or sys.stderr
+
+    class Listener(event.Listener):
+        def on_start(self, event: event.Event) -> None:
+            if not spoken:
+                spoken.append(time.perf_counter())
+                print("compiling for this machine, once: up to a minute ...", file=out, flush=True)
+
+        def on_end(self, event: event.Event) -> None:
+            spoken[1:] = [time.perf_counter()]
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
+    if len(spoken) == 2:
+        print(f"... ready after {spoken[1] - spoken[0]:.0f} s; the next run finds it done", file=out, flush=True)
 
 
 def core_count() -> int:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth.checks import direction, vector
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.media import rgb
@@ -40,22 +41,24 @@ def _row(kind: int, *columns: ArrayLike) -> np.ndarray:
 
 def point(position: ArrayLike, intensity: ArrayLike) -> np.ndarray:
     """A point that radiates ``intensity`` (RGB, W/sr) equally in all directions."""
-    return _row(POINT, rgb(intensity, "intensity"), position)
+    return _row(POINT, rgb(intensity, "intensity"), vector(position, "position"))
 
 
 def directional(towards: ArrayLike, irradiance: ArrayLike) -> np.ndarray:
     """A distant light seen in direction ``towards``; irradiance is RGB across the beam."""
-    direction = np.asarray(towards, float)
-    return _row(DIRECTIONAL, rgb(irradiance, "irradiance"), direction / np.linalg.norm(direction))
+    return _row(DIRECTIONAL, rgb(irradiance, "irradiance"), direction(towards, "towards"))
 
 
-def quad(corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, radiance: ArrayLike, back: str = "black") -> np.ndarray:
+def quad(
+    corner: ArrayLike, edge_u: ArrayLike, edge_v: ArrayLike, radiance: ArrayLike, back: str = "black"
+) -> np.ndarray:
     """The parallelogram corner + [0,1] edge_u + [0,1] edge_v; it radiates on the side of edge_u x edge_v.
 
     back: "black", a panel that also throws a shadow; or "clear", a lamp that is not there when seen from behind.
     """
     if back not in ("black", "clear"):
         raise InputError(f"quad: back must be black or clear, got '{back}'")
+    corner, edge_u, edge_v = vector(corner, "corner"), vector(edge_u, "edge_u"), vector(edge_v, "edge_v")
     row = _row(QUAD, rgb(radiance, "radiance"), corner, edge_u, edge_v)
     if not np.any(np.cross(row[10:13], row[13:16])):
         raise InputError(f"quad: expected edges that span a parallelogram, got {edge_u} and {edge_v}")

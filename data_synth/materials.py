@@ -50,7 +50,11 @@ def dielectric(ior: float, medium: int | None = None, priority: float = 0.0) -> 
     """A clear, smooth boundary: it reflects and refracts. ior: the index of refraction inside; outside of all it is 1.
 
     medium: the number of the medium inside, ``CLEAR`` for none; None: as the scene says. priority: where closed
-    boundaries overlap the highest counts, of equal ones the later material (Schmidt & Budge 2002).
+    boundaries overlap the highest counts, of equal ones the later material (Schmidt & Budge 2002). Boundaries must not
+    coincide: let the inner one overlap a little.
+
+    Radiance is not scaled by the squared index on its way in and out, which is right for light from outside. What glows
+    inside shows Le itself, not Le n^2: an isothermal scene disappears.
     """
     if not ior > 0:
         raise InputError(f"dielectric: ior must be positive, got {ior}")

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_synth import phase as phases
+from data_synth.checks import vector
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.sggx import projected_area
-from data_synth.vec import slab
+from data_synth.vec import slab, trilinear
 
 Point = Sequence[float] | np.ndarray
 BRICK = 8
@@ -161,7 +162,7 @@ def _medium(
     kind: int, lo: Point, hi: Point, cells: tuple[int, int, int], bounds: Sequence[np.ndarray],
     sigma_t: ArrayLike, albedo: ArrayLike, Le: ArrayLike, phase: phases.Phase | None,
 ) -> Medium:  # fmt: skip
-    lo, hi = triple(lo), triple(hi)
+    lo, hi = triple(vector(lo, "lo")), triple(vector(hi, "hi"))
     if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"medium: expected a box with lo < hi, got {lo} and {hi}")
     phase = phase or phases.isotropic()
@@ -192,7 +193,7 @@ def dense(m: Medium) -> np.ndarray:
 
 
 @jit
-def trilinear(m, values, p):
+def interpolated(m, values, p):
     """Interpolate brick samples ``values`` at p, 0 outside the stored bricks."""
     n = m.cells
     u = (p[0] - m.lo[0]) / m.cell[0]
@@ -204,23 +205,18 @@ def trilinear(m, values, p):
     first = m.offsets[((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3)]
     if first < 0:
         return 0.0
-    fu, fv, fw = u - i, v - j, w - k
     a = first + ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
     b = a + 81
-    low = (values[a] * (1.0 - fw) + values[a + 1] * fw) * (1.0 - fv) + (
-        values[a + 9] * (1.0 - fw) + values[a + 10] * fw
-    ) * fv
-    high = (values[b] * (1.0 - fw) + values[b + 1] * fw) * (1.0 - fv) + (
-        values[b + 9] * (1.0 - fw) + values[b + 10] * fw
-    ) * fv
-    return low * (1.0 - fu) + high * fu
+    corners = (values[a], values[a + 1], values[a + 9], values[a + 10])
+    others = (values[b], values[b + 1], values[b + 9], values[b + 10])
+    return trilinear(corners + others, u - i, v - j, w - k)
 
 
 @jit
 def density(m, p):
     """rho at a point inside the box."""
     if m.kind == GRID:
-        return trilinear(m, m.samples, p)
+        return interpolated(m, m.samples, p)
     if m.kind == EXPONENTIAL:
         return math.exp(-(p[2] - m.base) * m.falloff)
     return 1.0
@@ -229,7 +225,7 @@ def density(m, p):
 @jit
 def attribute(m, p):
     """The attribute at a point, 0 for media that have none."""
-    return trilinear(m, m.attributes, p) if m.attributes.size > 1 else 0.0
+    return interpolated(m, m.attributes, p) if m.attributes.size > 1 else 0.0
 
 
 @jit

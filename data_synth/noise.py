@@ -16,6 +16,7 @@ import numpy as np
 from data_synth.image import replacing
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.rng import mix
+from data_synth.vec import trilinear
 
 
 @jit
@@ -180,6 +181,6 @@ def texture_at(t, x, y, z, c):
     u, v, w = x - i, y - j, z - k
     i, j, k = i % n, j % n, k % n
     a, b, d = (i + 1) % n, (j + 1) % n, (k + 1) % n
-    low = (t[i, j, k, c] * (1 - w) + t[i, j, d, c] * w) * (1 - v) + (t[i, b, k, c] * (1 - w) + t[i, b, d, c] * w) * v
-    high = (t[a, j, k, c] * (1 - w) + t[a, j, d, c] * w) * (1 - v) + (t[a, b, k, c] * (1 - w) + t[a, b, d, c] * w) * v
-    return low * (1 - u) + high * u
+    near = (t[i, j, k, c], t[i, j, d, c], t[i, b, k, c], t[i, b, d, c])
+    far = (t[a, j, k, c], t[a, j, d, c], t[a, b, k, c], t[a, b, d, c])
+    return trilinear(near + far, u, v, w)

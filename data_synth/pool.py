@@ -37,13 +37,13 @@ def pool(media: Sequence[Medium]) -> Media:
         row += [m.flake_area, m.phase.kind, m.phase.g1, m.phase.g2, m.phase.mix]
         numbers[k, : len(row)] = row
         first[k + 1] = first[k] + [*(len(getattr(m, name)) for name in ARRAYS), len(m.phase.S)]
-    if not media:
-        return Media(
-            numbers, first, np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0),
-            np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)),
-        )  # fmt: skip
-    arrays = [np.concatenate([getattr(m, name) for m in media]) for name in ARRAYS]
-    return Media(numbers, first, *arrays, np.concatenate([m.phase.S for m in media]))
+    empty = [np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0), np.zeros(0)]
+    empty += [np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6))]
+    own = [[*(getattr(m, name) for name in ARRAYS), m.phase.S] for m in media]
+    offsets, samples, attributes, top, bottom, albedo, Le, S = (
+        np.concatenate(a) for a in zip(empty, *own, strict=True)
+    )
+    return Media(numbers, first, offsets, samples, attributes, top, bottom, albedo, Le, S)
 
 
 @jit

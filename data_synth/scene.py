@@ -106,7 +106,7 @@ class Scene:
             part = parts.pop()
             if isinstance(part, np.ndarray) and part.dtype != object:
                 digest.update(repr((part.shape, part.dtype.str)).encode())
-                digest.update(zlib.crc32(np.ascontiguousarray(part)).to_bytes(4, "little"))
+                digest.update(zlib.crc32(np.ascontiguousarray(part).data).to_bytes(4, "little"))
             elif isinstance(part, (tuple, list)):
                 digest.update(f"{len(part)} parts".encode())
                 parts += part

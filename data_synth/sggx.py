@@ -105,12 +105,17 @@ def sample_visible_normal(s, w, rng):
 
 
 @jit
-def eval_specular(s, wo, wi):
+def half_vector_density(s, wo, wi):
     h = add(wo, wi)
     length = math.sqrt(dot(h, h))
     if length < 1e-12:  # exactly forward: the half vector is any normal across the ray, never sampled
         return 0.0
-    return normal_density(s, scale(1.0 / length, h)) / (4.0 * projected_area(s, wo))
+    return normal_density(s, scale(1.0 / length, h))
+
+
+@jit
+def eval_specular(s, wo, wi):
+    return half_vector_density(s, wo, wi) / (4.0 * projected_area(s, wo))
 
 
 @jit

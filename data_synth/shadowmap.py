@@ -20,7 +20,7 @@ from data_synth.errors import InputError
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.lights import DIRECTIONAL, sample_light
 from data_synth.rng import new_rng
-from data_synth.vec import frame
+from data_synth.vec import frame, trilinear
 from data_synth.world import MARCHED, World, has_boundaries, inside_at, visible
 
 
@@ -134,9 +134,8 @@ def blend(v, at, stride_i, stride_j, stride_h, fu, fv, fw):
     """Trilinear mixture of eight stored numbers; NaN as long as any of them is missing."""
     e, f = at + stride_i, at + stride_j
     g = e + stride_j
-    low = (v[at] * (1.0 - fw) + v[at + stride_h] * fw) * (1.0 - fv) + (v[f] * (1.0 - fw) + v[f + stride_h] * fw) * fv
-    high = (v[e] * (1.0 - fw) + v[e + stride_h] * fw) * (1.0 - fv) + (v[g] * (1.0 - fw) + v[g + stride_h] * fw) * fv
-    return low * (1.0 - fu) + high * fu
+    near = (v[at], v[at + stride_h], v[f], v[f + stride_h])
+    return trilinear(near + (v[e], v[e + stride_h], v[g], v[g + stride_h]), fu, fv, fw)  # noqa: RUF005
 
 
 @jit

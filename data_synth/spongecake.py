@@ -24,7 +24,6 @@ from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.media import rgb
 from data_synth.rng import uniform
-from data_synth.vec import add, dot, scale
 
 
 def layer(tau: float, S: Sequence[float] | np.ndarray, albedo: ArrayLike) -> np.ndarray:
@@ -67,13 +66,6 @@ def depth_integral(tau, lo, li, reflected):
 
 
 @jit
-def half_vector_density(s, wo, wi):
-    h = add(wo, wi)
-    length = math.sqrt(dot(h, h))
-    return sggx.normal_density(s, scale(1.0 / length, h)) if length > 1e-12 else 0.0
-
-
-@jit
 def other_legs(layers, first, last, k, wo, wi):
     """Attenuation by the layers other than k that the two legs of a path scattered in layer k cross."""
     to = attenuation(layers, first, k, wo) if wo[2] > 0.0 else attenuation(layers, k + 1, last, wo)
@@ -90,7 +82,7 @@ def evaluate(layers, first, last, wo, wi):
     for k in range(first, last):
         s = flakes(layers, k)
         depth = depth_integral(layers[k, 0], slant(s, wo), slant(s, wi), wo[2] * wi[2] > 0.0)
-        f = half_vector_density(s, wo, wi) / (4.0 * cosines) * depth * other_legs(layers, first, last, k, wo, wi)
+        f = sggx.half_vector_density(s, wo, wi) / (4.0 * cosines) * depth * other_legs(layers, first, last, k, wo, wi)
         r, g, b = r + f * layers[k, 7], g + f * layers[k, 8], b + f * layers[k, 9]
     return (r, g, b)
 
@@ -103,7 +95,7 @@ def pdf(layers, first, last, wo, wi):
         k = first + n if wo[2] > 0.0 else last - 1 - n
         s = flakes(layers, k)
         through = math.exp(-layers[k, 0] * slant(s, wo))
-        f = half_vector_density(s, wo, wi) / (4.0 * sggx.projected_area(s, wo))
+        f = sggx.half_vector_density(s, wo, wi) / (4.0 * sggx.projected_area(s, wo))
         total += reach * (1.0 - through) * f
         reach *= through
     return total

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth.checks import direction, vector
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.vec import along, cross, dot, extent, slab, sub, unit
@@ -34,24 +35,30 @@ class Geometry(NamedTuple):
 
 def plane(material: int, point: ArrayLike, normal: ArrayLike) -> np.ndarray:
     """An infinite plane."""
-    n = np.asarray(normal, float)
-    return _shape(PLANE, material, point, n / np.linalg.norm(n))
+    return _shape(PLANE, material, vector(point, "point"), direction(normal, "normal"))
 
 
 def sphere(material: int, centre: ArrayLike, radius: float) -> np.ndarray:
     if not radius > 0:
         raise InputError(f"sphere: radius must be positive, got {radius}")
-    return _shape(SPHERE, material, centre, [radius])
+    return _shape(SPHERE, material, vector(centre, "centre"), [radius])
 
 
 def box(material: int, lo: ArrayLike, hi: ArrayLike) -> np.ndarray:
     """An axis-aligned box."""
+    lo, hi = vector(lo, "lo"), vector(hi, "hi")
+    if not (lo < hi).all():
+        raise InputError(f"box: expected lo < hi, got {lo.tolist()} and {hi.tolist()}")
     return _shape(BOX, material, lo, hi)
 
 
 def mesh(material: int, vertices: ArrayLike, faces: ArrayLike) -> np.ndarray:
     """(m, 12) rows of triangles from (n, 3) vertices and (m, 3) vertex numbers."""
     points, corners = np.asarray(vertices, float), np.asarray(faces)
+    if points.ndim != 2 or points.shape[1] != 3 or corners.ndim != 2 or corners.shape[1] != 3:
+        raise InputError(f"mesh: expected (n, 3) vertices and (m, 3) faces, got {points.shape} and {corners.shape}")
+    if corners.dtype.kind not in "iu":
+        raise InputError(f"mesh: expected whole numbers of vertices as faces, got {corners.dtype}")
     if not np.isfinite(points).all() or corners.size and (corners.min() < 0 or corners.max() >= len(points)):
         raise InputError("mesh: expected finite vertices and faces that number them")
     a, b, c = (points[corners[:, k]] for k in range(3))

@@ -100,6 +100,14 @@ def slab(ray, lo, hi, t0, t1):
 
 
 @jit
+def trilinear(c, u, v, w):
+    """Eight corners c, the last axis fastest, at fractions u, v, w of the first, second and last axis."""
+    low = (c[0] * (1.0 - w) + c[1] * w) * (1.0 - v) + (c[2] * (1.0 - w) + c[3] * w) * v
+    high = (c[4] * (1.0 - w) + c[5] * w) * (1.0 - v) + (c[6] * (1.0 - w) + c[7] * w) * v
+    return low * (1.0 - u) + high * u
+
+
+@jit
 def extent(a):
     """The largest absolute coordinate: what rounding errors of a point are relative to."""
     return max(abs(a[0]), abs(a[1]), abs(a[2]))

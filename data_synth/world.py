@@ -21,7 +21,7 @@ from data_synth.media import Medium
 from data_synth.pool import Media, medium_at
 from data_synth.spongecake import attenuation
 from data_synth.surfaces import Geometry, contains, hit_mesh, intersect
-from data_synth.transmittance import shadow_transmittance
+from data_synth.trackers import shadow_transmittance
 from data_synth.vec import along, cross, dot, largest, mul, neg
 
 COUNTERS = 15  # boundary materials of one scene: four bits each

@@ -7,7 +7,9 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from data_synth import lights
+import numpy as np
+
+from data_synth import checks, lights
 from data_synth.errors import InputError
 from data_synth.scene import Scene
 from data_synth.scenes.showcase import Showcase
@@ -46,28 +48,33 @@ def make(name: str, light: str | None = None, **parameters: Any) -> Showcase | S
     """
     if name not in SCENES:
         raise InputError(f"unknown scene '{name}', expected one of {', '.join(SCENES)}{_hint(name, SCENES)}")
-    factory = SCENES[name]
-    known = list(inspect.signature(factory).parameters)
+    defaults = parameters_of(name)
     for key in parameters:
-        if key not in known:
+        if key not in defaults:
             raise InputError(
-                f"scene {name} has no parameter '{key}', expected one of {', '.join(known)}{_hint(key, known)}"
+                f"scene {name} has no parameter '{key}', expected one of {', '.join(defaults) or 'none'}{_hint(key, defaults)}"
             )
-    try:
-        scene = factory(**parameters)
-    except TypeError as error:
-        raise InputError(f"scene {name}: a parameter has the wrong type: {error}") from error
-    scene.name, scene.parameters = name, dict(parameters)
+    given = {key: checks.parameter(name, key, value, defaults[key]) for key, value in parameters.items()}
+    scene = SCENES[name](**given)
+    scene.name, scene.parameters = name, dict(given)
     if light is not None:
-        names = light.split(",")
-        for each in names:
-            if each not in LIGHTS or isinstance(scene, Showcase):
-                what = "the showcase keeps its own" if name == "showcase" else f"one of {', '.join(LIGHTS)}"
-                raise InputError(f"--light: expected {what}, got '{each}'{_hint(each, LIGHTS)}")
-        if isinstance(scene, Scene):
-            scene.lights = [LIGHTS[each] for each in names]
+        if not isinstance(scene, Scene):
+            raise InputError("--light: the showcase keeps its own lights, expected no other")
+        scene.lights = [named_light(each) for each in light.split(",")]
         scene.parameters["light"] = light
     return scene
+
+
+def named_light(name: str) -> np.ndarray:
+    """A row of LIGHTS."""
+    if name not in LIGHTS:
+        raise InputError(f"--light: expected one of {', '.join(LIGHTS)}, got '{name}'{_hint(name, LIGHTS)}")
+    return LIGHTS[name]
+
+
+def parameters_of(name: str) -> dict[str, Any]:
+    """The parameters of a scene and their defaults."""
+    return {key: p.default for key, p in inspect.signature(SCENES[name]).parameters.items()}
 
 
 def _hint(word: str, known: Iterable[str]) -> str:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from data_synth import checks
 from data_synth.cameras import Camera, Viewpoints, pixel_ray
 from data_synth.image import Picture
 from data_synth.jit import in_bands, jit, kernel
@@ -205,12 +206,14 @@ class Showcase:
     exposure = 1.0
 
     def __init__(self, haze: float = 4.5, steps: int = 96, smooth: int = 2) -> None:
+        for key, value in {"haze": haze, "steps": steps, "smooth": smooth}.items():
+            checks.parameter("showcase", key, value, 4.5 if key == "haze" else 1)
         self.haze = Haze(sigma=float(haze), radius=0.62, width=0.13, height=0.28, steps=int(steps))
         self.smooth = int(smooth)
         self.parameters: dict = {}
 
     def render(self, camera: Camera, *, seed: int = 0) -> Picture:
-        """One ray per pixel centre; pixels at an edge are the mean of a regular grid of rays. Nothing is random: seed is ignored."""
+        """One ray per pixel centre; pixels at an edge are the mean of a regular grid of rays. No chance: no use for a seed."""
         out = np.empty((camera.height, camera.width, 5))
         data = camera.data()
         in_bands(lambda first, last: render_rows(self.haze, data, out, first, last), camera.height)

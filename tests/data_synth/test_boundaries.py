@@ -28,11 +28,15 @@ def look(scene, eye=(0, -4.0, 0)):
 
 def balls(*places, material=None):
     return {
-        "shapes": [surfaces.sphere(k if material is None else material, (0, y, 0), r) for k, (y, r) in enumerate(places)]
+        "shapes": [
+            surfaces.sphere(k if material is None else material, (0, y, 0), r) for k, (y, r) in enumerate(places)
+        ]
     }
 
 
-@pytest.mark.parametrize("places, length", [(((-0.5, 0.8), (0.5, 0.8)), 2.6), (((0, 0.8), (0.1, 0.4)), 1.6), (((0, 0.8), (0, 0.79)), 1.6)])
+@pytest.mark.parametrize(
+    "places, length", [(((-0.5, 0.8), (0.5, 0.8)), 2.6), (((0, 0.8), (0.1, 0.4)), 1.6), (((0, 0.8), (0, 0.79)), 1.6)]
+)
 def test_boundaries_of_one_kind_may_overlap_and_nest(places, length):
     scene = Scene(medium=box(), materials=[materials.null()], bounded=True, **balls(*places, material=0))
     assert look(scene) == pytest.approx(length * SIGMA, abs=1e-9)
@@ -45,7 +49,12 @@ def test_clear_glass_in_fog_holds_no_fog():
     for ior in (1.0, 1.0 + 1e-12):
         scene = Scene(medium=box(), materials=[materials.dielectric(ior)], **balls((0.3, 0.5)))
         assert look(scene) == pytest.approx(3.0 * SIGMA, abs=1e-6)
-    scene = Scene(medium=box(), materials=[materials.null(), materials.dielectric(1.0)], bounded=True, **balls((0, 1.2), (0.3, 0.5)))
+    scene = Scene(
+        medium=box(),
+        materials=[materials.null(), materials.dielectric(1.0)],
+        bounded=True,
+        **balls((0, 1.2), (0.3, 0.5)),
+    )
     scene.materials[1] = materials.dielectric(1.0, medium=materials.CLEAR)
     assert look(scene) == pytest.approx(1.4 * SIGMA, abs=1e-9)
 
@@ -82,7 +91,20 @@ def test_a_grid_in_a_ball_in_fog():
 
 def test_a_mesh_bounds_like_the_box_that_it_is():
     v = np.array([[x, y, z] for x in (-0.7, 0.7) for y in (-0.5, 0.9) for z in (-0.6, 0.6)])
-    f = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    f = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
     scene = Scene(medium=box(), triangles=surfaces.mesh(0, v, np.array(f)), materials=[materials.null()], bounded=True)
     assert look(scene, (0.03, -4.0, 0.01)) == pytest.approx(1.4 * SIGMA, rel=1e-3)
     assert look(scene, (0.0, 0.2, 0.01)) == pytest.approx(0.7 * SIGMA, rel=1e-3)
@@ -100,7 +122,11 @@ def test_nested_glass_refracts_by_both_indices():
     picture = Path(spp=600, jitter=False).render(scene, c)
     assert_means(picture.rgb, picture.variance, sky)
     one = Scene(materials=[materials.dielectric(1.33)], lights=[lights.sky(sky, 0.1, 0.9)], **balls((0, 0.9)))
-    two = Scene(materials=[materials.dielectric(1.33), materials.dielectric(1.33)], lights=one.lights, **balls((0, 0.9), (0.1, 0.5)))
+    two = Scene(
+        materials=[materials.dielectric(1.33), materials.dielectric(1.33)],
+        lights=one.lights,
+        **balls((0, 0.9), (0.1, 0.5)),
+    )
     a, b = (Path(spp=20, jitter=False).render(s, c, seed=3).rgb for s in (one, two))
     assert np.allclose(a, b, atol=1e-9)
 

@@ -158,7 +158,10 @@ def test_a_changed_scene_is_rendered_anew():
         kept, scene.medium = scene.medium, scene.medium._replace(sigma_t=(0.0, 0.0, 0.0))
         assert integrator.render(scene, c).alpha.max() == 0.0
         scene.medium = kept._replace(samples=2 * kept.samples, brick_max=2 * kept.brick_max, max_density=2.0)
-        assert integrator.render(scene, c).alpha.min() > 1.05 * integrator.render(Scene(medium=kept, lights=scene.lights), c).alpha.max()
+        assert (
+            integrator.render(scene, c).alpha.min()
+            > 1.05 * integrator.render(Scene(medium=kept, lights=scene.lights), c).alpha.max()
+        )
         scene.medium = kept
         scene.opaque_sky = True
         assert integrator.render(scene, c).alpha.min() == 1.0
@@ -184,6 +187,7 @@ def test_default_paths_have_no_last_order():
 
 def everything(k):
     """A scene of every kind of object, k times as large."""
+
     def rho(x, y, z):
         return np.clip(1.2 - np.sqrt(x * x + y * y + z * z) / k + 0.3 * np.sin(5 * x / k), 0, 1)
 
@@ -203,6 +207,7 @@ def everything(k):
 @pytest.mark.parametrize("integrator", [Path(spp=20), March(beams=3), DeepShadow(beams=3, resolution=8)])
 def test_scenes_of_any_size_look_alike(integrator):
     """A power of two changes no digit of any product: pictures must be equal to the last rounding of exp and sums."""
+
     def render_at(k):
         return integrator.render(everything(k), camera(k * np.array([0.1, -3.0, 0.4]), size=8, focal=9.0))
 
@@ -215,6 +220,7 @@ def test_scenes_of_any_size_look_alike(integrator):
 
 def test_shadow_rays_of_a_march_pass_straight_through_glass():
     """A medium in glass that hardly refracts is lit as without glass."""
+
     def ball(material):
         m = cube("grid", albedo=ALBEDO)
         return Scene(
@@ -223,7 +229,9 @@ def test_shadow_rays_of_a_march_pass_straight_through_glass():
         )  # fmt: skip
 
     for integrator in (March(beams=5), DeepShadow(beams=5, resolution=12)):
-        free, glass = (integrator.render(ball(b), camera()).rgb for b in (materials.null(), materials.dielectric(1.0001)))
+        free, glass = (
+            integrator.render(ball(b), camera()).rgb for b in (materials.null(), materials.dielectric(1.0001))
+        )
         # rays that come to the glass at a grazing angle bend and mirror most
         assert free.min() > 0.01 and np.allclose(glass, free, rtol=0.01)
     scene = Scene(
@@ -269,7 +277,9 @@ def test_a_point_light_in_the_medium_has_the_variance_that_equiangular_sampling_
             a = sigma / (sigma + equi)
             return F, F * a, (F * a) ** 2 / own, (F * (1 - a)) ** 2 / equi
 
-        F, A, AA, BB = (integrate.quad(lambda t, k=k: parts(t)[k], t0, t1, points=[near], epsabs=1e-13)[0] for k in range(4))
+        F, A, AA, BB = (
+            integrate.quad(lambda t, k=k: parts(t)[k], t0, t1, points=[near], epsabs=1e-13)[0] for k in range(4)
+        )
         variance = AA - A**2 + BB - (F - A) ** 2
         assert_means(picture.rgb[i][0], variance / n, F)
         # Russian roulette of weak next events adds to the variance: f / 0.1 survives, from 0.26 up at g = 0.3

@@ -202,15 +202,50 @@ def test_command_line(tmp_path, capsys):
         (["clod", "--out", "x"], "did you mean cloud?"),
         (["slab", "--out", "x", "--set", "sigm=1"], "did you mean sigma?"),
         (["slab", "--out", "x", "--set", "sigma"], "KEY=VALUE"),
-        (["slab", "--out", "x", "--set", "sigma=-1"], "sigma_t"),
-        (["slab", "--out", "x", "--set", "sigma=abc"], "wrong type"),
+        (["slab", "--out", "x", "--set", "sigma=-1"], "sigma expects a number from 0"),
+        (["slab", "--out", "x", "--set", "sigma=abc"], "sigma expects a number"),
+        (["slab", "--out", "x", "--set", "sigma=nan"], "sigma expects a number"),
+        (["slab", "--out", "x", "--set", "sigma=True"], "sigma expects a number"),
         (["slab", "--out", "x", "--size", "40"], "WxH"),
+        (["slab", "--out", "x", "--size", "-8x8"], "--size"),
         (["slab", "--out", "x", "--views", "0"], "--views"),
+        (["slab", "--out", "x", "--views", "two"], "--views"),
+        (["slab", "--out", "x", "--veiws", "2"], "--veiws"),
+        (["slab", "--out", "x", "--seed", "-1"], "--seed"),
         (["slab", "--out", "x", "--integrator", "deep"], "emission, path"),
         (["slab", "--out", "x", "--light", "sin"], "did you mean sun?"),
+        (["slab", "--out", "x", "--light", ""], "--light"),
+        (["slab", "--out", "x", "--spp", "4"], "--spp"),
+        (["slab", "--out", "x", "--max-depth", "4"], "--max-depth"),
+        (["slab", "--out", "x", "--integrator", "path", "--max-depth", "-1"], "--max-depth"),
+        (["slab", "--out", "x", "--integrator", "path", "--spp", "0"], "--spp"),
+        (["slab", "--out", "x", "--side", "0"], "--side"),
+        (["slab", "--out", "x", "--step", "0"], "--step"),
+        (["slab", "--out", "x", "--step", "nan"], "--step"),
+        (["slab", "--out", "x", "--fov", "180"], "--fov"),
+        (["slab", "--out", "x", "--exposure", "0"], "--exposure"),
         (["slab"], "--out"),
+        (["slab", "--out", "x", "--picture", "y.png"], "both"),
+        (["slab", "--picture", "nodir/a.png"], "a folder that exists"),
+        (["slab", "--picture", "a.gif"], ".jpg or .png"),
+        (["list", "--out", "x"], "nothing else"),
+        (["cloud", "--out", "x", "--set", "seed=abc"], "whole number from 0"),
+        (["cloud", "--out", "x", "--set", "resolution=-5"], "from 8 to 1024"),
+        (["cloud", "--out", "x", "--set", "resolution=100000"], "from 8 to 1024"),
+        (["cloud", "--out", "x", "--set", "resolution=16", "--fill", "swep"], "sweep, eager or lazy"),
+        (["cloud", "--out", "x", "--set", "resolution=16", "--resolution", "1"], "--resolution"),
+        (["showcase", "--out", "x", "--set", "steps=-1"], "from 1 to 100000"),
+        (["showcase", "--out", "x", "--set", "steps=0"], "from 1 to 100000"),
+        (["showcase", "--out", "x", "--set", "haze=-5"], "haze expects"),
+        (["showcase", "--out", "x", "--light", "sun"], "keeps its own lights"),
+        (["showcase", "--out", "x", "--integrator", "path"], "takes emission"),
+        (["showcase", "--out", "x", "--step", "0.1"], "no medium"),
+        (["solids", "--out", "x", "--step", "0.1"], "no medium"),
         (["bench", "tow"], "one, sky"),
         (["smoke", "--out", "x", "--volume", "missing.vdb"], "missing.vdb"),
+        (["smoke", "--out", "x", "--volume", ""], "--volume"),
+        (["scene.yaml", "--out", "x"], "cannot be read"),
+        (["scene.yaml", "--out", "x", "--light", "sun"], "says these itself"),
     ],
 )
 def test_bad_command_lines_are_one_sentence_and_code_2(argv, message, capsys, tmp_path, monkeypatch):
@@ -219,6 +254,43 @@ def test_bad_command_lines_are_one_sentence_and_code_2(argv, message, capsys, tm
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and "Traceback" not in error
     assert not (tmp_path / "x" / "transforms_train.json").exists()
+
+
+@pytest.mark.parametrize("arguments", [{"steps": -1}, {"steps": 0}, {"haze": -1.0}, {"smooth": 0}])
+def test_the_showcase_refuses_what_it_cannot_integrate(arguments):
+    with pytest.raises(InputError, match=next(iter(arguments))):
+        Showcase(**arguments)
+
+
+@pytest.mark.parametrize("name", scenes.SCENES)
+def test_help_tells_parameters_defaults_and_integrators(name, capsys):
+    with pytest.raises(SystemExit) as done:
+        main([name, "--help"])
+    told = capsys.readouterr().out
+    assert done.value.code == 0 and scenes.summary(name) in told and "its own choice first" in told
+    for key, default in scenes.parameters_of(name).items():
+        assert ("--volume FILE" if key == "volume" else f"--set {key}={default}") in told
+
+
+def test_options_reach_the_picture(tmp_path):
+    """Each of --step --exposure --fov --side --max-depth --seed changes the files."""
+
+    def written(*options):
+        folder = tmp_path / "-".join(options).replace(".", "_")
+        assert main(["slab", "--views", "1", "--size", "6x5", "--out", str(folder), "--exr", *options]) == 0
+        return (
+            (folder / "train/r_0.exr").read_bytes(),
+            (folder / "train/r_0.png").read_bytes(),
+            json.loads((folder / "transforms_train.json").read_text()),
+        )
+
+    plain = written()
+    assert written("--step", "0.2")[0] != plain[0] and written("--side", "2")[0] != plain[0]
+    bright = written("--exposure", "0.5")
+    assert bright[0] == plain[0] and bright[1] != plain[1]
+    assert written("--fov", "20")[2]["camera_angle_x"] == pytest.approx(np.radians(20.0))
+    one = written("--integrator", "path", "--spp", "2", "--max-depth", "0")
+    assert one[0] != written("--integrator", "path", "--spp", "2", "--seed", "5")[0]
 
 
 def test_render_is_public():
