@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from nerfvol.errors import InputError
 from nerfvol.native import native
 
 
@@ -52,6 +53,16 @@ def available_memory() -> int | None:
     except (OSError, ValueError, IndexError):  # outside Linux
         pass
     return total_memory()
+
+
+def require_memory(need: int, what: str) -> None:
+    """An InputError where ``need`` bytes for ``what`` are more than there are now."""
+    have = available_memory()
+    if have is not None and need > have:
+        raise InputError(
+            f"{what} would take {need / 2**30:.1f} GiB of memory, and {have / 2**30:.1f} GiB are free: it is damaged, or made "
+            "for a larger machine"
+        )
 
 
 def peak_memory() -> int | None:

@@ -60,7 +60,8 @@ def _print(record: dict[str, Any]) -> None:
         _print_file(record["file"])
     if "octree" in record:
         file, stats = record["file"], record["octree"]
-        print(f"root cube       {_numbers(file['aabb'][0])} to {_numbers(file['aabb'][1])}")
+        low, size = file["origin"], file["size"]
+        print(f"root cube       {_numbers(low)} to {_numbers([x + size for x in low])}")
         print(f"leaves          {stats['leaves']:,} of {stats['nodes']:,} nodes, {stats['vertices']:,} vertices")
         levels = ", ".join(f"{2**level}³: {count:,}" for level, count in stats["leaves_by_level"].items())
         print(f"by resolution   {levels}")
@@ -80,7 +81,9 @@ def _print_file(file: dict[str, Any]) -> None:
         print(f"file            {file['path']} ({file['bytes'] / 1e6:.1f} MB)")
         return
     print(f"file            {file['path']} ({file['bytes'] / 1e6:.1f} MB, {file.get('storage', 'float32')})")
-    print(f"format          {file['format']} {file['version']}, written by nerfvol {file['nerfvol']}")
+    print(
+        f"format          {file['format']} {file['version']}, written by nerfvol {file.get('nerfvol', '(no version)')}"
+    )
     print(f"colour          {file['colour']}, SH degree {file['sh_degree']}")
     for key, value in file["metadata"].items():
         print(f"{key:15s} {json.dumps(value)}")

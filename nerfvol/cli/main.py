@@ -70,7 +70,7 @@ def _sentence(error: Exception) -> str | None:
     if isinstance(error, InputError) or (synth is not None and isinstance(error, synth.InputError)):
         return " ".join(str(error).split())
     if isinstance(error, MemoryError):
-        return "the machine's memory is used up; try a larger --downscale"
+        return "the machine's memory is used up; try smaller pictures (--downscale, --size)"
     if isinstance(error, OSError):
         from nerfvol.files.atomic import explain_os_error
 

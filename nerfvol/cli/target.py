@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from nerfvol.config.assemble import run_settings
 from nerfvol.config.values import Colour, coerce
 from nerfvol.defaults import WHITE
+from nerfvol.errors import InputError, shown
 from nerfvol.files.run_folder import model_path
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Target:
 
         stored = self.model.metadata.get("orbit")
         if isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys():
-            return stored
+            return _checked(stored, self.path)
         if dataset := self._dataset():
             return describe_orbit(dataset.cameras, dataset.scene.aabb)
         return default_orbit(self.model.aabb())
@@ -50,6 +51,34 @@ class Target:
         from nerfvol.datasets.load import load_dataset
 
         return load_dataset(data, "train")
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "radius": (1e-300, 1e15), "elevation_deg": (-89.999, 89.999), "camera_angle_x": (1e-6, 3.14159), "azimuth_deg": (-1e6, 1e6),
+    "arc_deg": (0, 360),
+}  # fmt: skip
+_VECTORS = {"center": (3, 1e15), "up": (3, 1e15), "size": (2, 16384)}
+
+
+def _checked(orbit: dict[str, Any], path: Path) -> dict[str, Any]:
+    """An orbit that a file states; InputError where one of its fields is not what it should be."""
+
+    def is_number(value: Any, low: float, high: float) -> bool:
+        return type(value) in (int, float) and low <= value <= high
+
+    for name, (low, high) in _RANGES.items():
+        if name in orbit and not is_number(orbit[name], low, high):
+            raise InputError(
+                f"{path}: its orbit's {name} is {shown(orbit[name])}, expected a number from {low:g} to {high:g}"
+            )
+    for name, (length, most) in _VECTORS.items():
+        value, least = orbit.get(name), 1 if name == "size" else -most
+        if value is None and name != "center":
+            continue
+        fits = isinstance(value, list) and len(value) == length and all(is_number(x, least, most) for x in value)
+        if not fits or (name == "up" and not any(value)):
+            raise InputError(f"{path}: its orbit's {name} is {shown(value)}, expected {length} numbers up to {most:g}")
+    return orbit
 
 
 def open_target(name: str, background: Sequence[float] | None = None) -> Target:

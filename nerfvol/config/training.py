@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
+SMALLEST_PICTURE = 24
+"""Pixels along the shorter side, below which no stage averages pictures by itself."""
 FINEST_LEVEL = 16
 """Of a stage's leaves, where the numbers of octree.topology end."""
 Degree = Annotated[int, within(0, 3)]
@@ -292,6 +294,28 @@ class OctreeConfig(Checked):
         """The same with a number for each None; photographs are scenes with background shells."""
         return filled(self, BOUNDED if not scene.is_unbounded else PHOTOGRAPHS)
 
+    def for_pictures(self, side: int) -> OctreeConfig:
+        """The same with stages that suit pictures of ``side`` pixels along their shorter side.
+
+        Where nobody chose the stages, none averages pictures below SMALLEST_PICTURE: the rays of a tile of 4x4-pixel pictures
+        cover the whole field of view, which makes a step ten times as long and teaches nothing. Nor are leaves asked for that
+        are smaller than half a pixel, and of stages that become alike the last is left, with one pruning each before it.
+        """
+        plain = OctreeConfig()
+        names = ("levels", "downscales", "stage_ends", "tiles", "prunes")
+        most = max(1, side // SMALLEST_PICTURE)
+        if any(getattr(self, name) != getattr(plain, name) for name in names) or most >= max(self.downscales):
+            return self
+        factor, level = 1 << (most.bit_length() - 1), max(self.levels[0], (2 * side).bit_length() - 1)
+        rows = [(min(row[0], level), min(row[1], factor), *row[2:])
+                for row in zip(*(getattr(self, name) for name in names), strict=True)]  # fmt: skip
+        kept = [
+            row for row, after in zip(rows, [*rows[1:], None], strict=True) if after is None or row[:2] != after[:2]
+        ]
+        columns = {name: [row[i] for row in kept] for i, name in enumerate(names)}
+        columns["prunes"] = [min(n, 1) for n in columns["prunes"][:-1]] + columns["prunes"][-1:]
+        return dataclasses.replace(self, **columns)
+
 
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,
            "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000}  # fmt: skip
@@ -404,6 +428,10 @@ class Config(Checked):
             named = "octree" if self.init in OCTREE_STARTS else "auto" if self.init == "auto" else "splats"
             chosen = ("splats" if scene.is_unbounded else "octree") if named == "auto" else named
         return dataclasses.replace(self, **sections, representation=chosen)
+
+    def for_pictures(self, side: int) -> Config:
+        """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""
+        return dataclasses.replace(self, octree=self.octree.for_pictures(side))
 
     def before(self, backdrop: tuple[float, float, float] | None) -> Config:
         """The same with a background: as given, else ``backdrop``, the colour that the pictures have behind, else white.

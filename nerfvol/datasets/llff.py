@@ -7,9 +7,6 @@ original photographs. Source: docs/data.md.
 
 from __future__ import annotations
 
-import struct
-import tokenize
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +17,9 @@ from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.colmap_files import read_images
 from nerfvol.datasets.listing import Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
 from nerfvol.errors import InputError
+from nerfvol.files.numpyfile import read_npy
 
 POSES = "poses_bounds.npy"
-# numpy parses the header as Python literals, so a damaged one can raise whatever that parser does
-_LOAD_ERRORS = (
-    OSError, ValueError, EOFError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError, OverflowError,
-    struct.error, tokenize.TokenError, zipfile.BadZipFile,
-)  # fmt: skip
 
 
 def recognises(path: Path) -> bool:
@@ -102,12 +95,9 @@ def image_folder(folder: Path) -> Path:
 
 
 def _load_rows(path: Path) -> NDArray[np.float64]:
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except _LOAD_ERRORS as error:
-        raise InputError(f"{path}: expected a numpy array of poses, but it cannot be read ({error})") from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
-        raise InputError(f"{path}: expected an array of shape (views, 17), got {getattr(rows, 'shape', type(rows))}")
+    rows = read_npy(path, "a numpy array of poses")
+    if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
+        raise InputError(f"{path}: expected an array of shape (views, 17), got {rows.shape}")
     if not np.issubdtype(rows.dtype, np.floating):
         raise InputError(f"{path}: expected floating-point numbers, got {rows.dtype}")
     if not np.isfinite(rows[:, [4, 9, 14]]).all():

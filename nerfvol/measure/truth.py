@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.files.numpyfile import read_npz
 from nerfvol.files import pictures
 from nerfvol.kernels import ops
 from nerfvol.octree.points import octree_density
@@ -57,12 +58,11 @@ def load_grid(path: str | Path) -> Grid:
     Raises:
         InputError: missing or unreadable file, or arrays that are no grid of finite, non-negative numbers.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            sigma, lo, hi, voxel = (np.asarray(file[k], np.float64) for k in ("density", "lo", "hi", "voxel_size"))
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: expected the density.npz of a synthetic scene, {error}") from error
-    if sigma.ndim != 3 or not np.isfinite(sigma).all() or sigma.min() < 0 or not (voxel > 0).all():
+    found = read_npz(path, ("density", "lo", "hi", "voxel_size"), "the density.npz of a synthetic scene")
+    if not all(np.issubdtype(array.dtype, np.number) and np.isrealobj(array) for array in found.values()):
+        raise InputError(f"{path}: expected the density.npz of a synthetic scene, but its arrays are no real numbers")
+    sigma, lo, hi, voxel = (array.astype(np.float64) for array in found.values())
+    if sigma.ndim != 3 or not sigma.size or not np.isfinite(sigma).all() or sigma.min() < 0 or not (voxel > 0).all():
         raise InputError(f"{path}: expected a 3-D grid of finite, non-negative densities, got shape {sigma.shape}")
     if any(a.shape != (3,) for a in (lo, hi, voxel)) or not (np.isfinite([lo, hi]).all() and (lo < hi).all()):
         raise InputError(

@@ -6,7 +6,6 @@ the topology (a vertex count that the masks cannot have is refused), then the va
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from typing import Any, Literal, cast, get_args
@@ -14,8 +13,9 @@ from typing import Any, Literal, cast, get_args
 import numpy as np
 
 from nerfvol import __version__
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
+from nerfvol.machine import require_memory
 from nerfvol.octree import codec
 from nerfvol.octree.rows import BLOCKS
 from nerfvol.octree.topology import number_corners
@@ -114,6 +114,8 @@ def load_octree(path: str | os.PathLike[str]) -> tuple[Octree, dict[str, Any]]:
         n_leaves = int(np.unpackbits(leaf_mask).sum())
         if not n_leaves < n_vertices <= 8 * n_leaves:
             raise file.fault(f"it declares {n_vertices} vertices, which {n_leaves} leaves cannot have")
+        row, channels = 64 * BLOCKS[degree], 1 + 3 * (degree + 1) ** 2
+        require_memory(n_vertices * (row + 8 * channels) + 128 * n_leaves, str(path))  # a bomb is refused, not tried
         try:
             octree = Octree(node_mask, leaf_mask, **frame)
         except InputError as error:
@@ -145,28 +147,36 @@ def _check_document(file: ArrayFile) -> dict[str, Any]:
     """The arguments of Octree, and n_vertices, from the file's document."""
     document = file.document
     if document.get("format") != FORMAT:
-        raise file.fault(f"expected the format {FORMAT!r}, it says {document.get('format')!r}")
+        raise file.fault(f"expected the format {FORMAT!r}, it says {shown(document.get('format'))}")
     if document.get("version") not in (VERSION, MAPPED_VERSION):
         known = f"versions {VERSION} and {MAPPED_VERSION}"
-        raise file.fault(f"this nerfvol reads {known}, it has version {document.get('version')!r}")
+        raise file.fault(f"this nerfvol reads {known}, it has version {shown(document.get('version'))}")
     for key, known in (("colour", COLOUR_CONVENTION), ("density", DENSITY_CONVENTION)):
         if document.get(key) != known:
-            raise file.fault(f"its {key} convention is {document.get(key)!r}, expected {known!r}")
+            raise file.fault(f"its {key} convention is {shown(document.get(key))}, expected {known!r}")
     if document.get("storage") not in get_args(Storage):
-        raise file.fault(f"its storage is {document.get('storage')!r}, expected one of {', '.join(get_args(Storage))}")
+        raise file.fault(f"its storage is {shown(document.get('storage'))}, expected one of {', '.join(get_args(Storage))}")
     if not isinstance(document.get("metadata"), dict):
         raise file.fault("its metadata is not a JSON object")
+    box = document.get("aabb")
+    if box is not None and not (
+        isinstance(box, list) and len(box) == 2
+        and all(isinstance(c, list) and len(c) == 3 and all(_is_number(x, -1e13, 1e13) for x in c) for c in box)
+    ):  # fmt: skip
+        raise file.fault(f"its aabb is {shown(box)}, expected two corners of three numbers")
+    if not isinstance(document.get("nerfvol", ""), str):
+        raise file.fault(f"it says that nerfvol {shown(document['nerfvol'])} wrote it, expected a version")
     degree, n_vertices = document.get("sh_degree"), document.get("n_vertices")
     if type(degree) is not int or not 0 <= degree <= 3:
-        raise file.fault(f"its sh_degree is {degree!r}, expected 0, 1, 2 or 3")
+        raise file.fault(f"its sh_degree is {shown(degree)}, expected 0, 1, 2 or 3")
     if type(n_vertices) is not int or n_vertices < 0:
-        raise file.fault(f"its n_vertices is {n_vertices!r}, expected a count")
+        raise file.fault(f"its n_vertices is {shown(n_vertices)}, expected a count")
     origin = document.get("origin")
     if not isinstance(origin, list) or len(origin) != 3 or not all(_is_number(x, -1e12, 1e12) for x in origin):
-        raise file.fault(f"its origin is {origin!r}, expected three finite numbers")
+        raise file.fault(f"its origin is {shown(origin)}, expected three finite numbers")
     for key in ("size", "density_scale"):
         if not _is_number(document.get(key), 1e-12, 1e12):
-            raise file.fault(f"its {key} is {document.get(key)!r}, expected a positive number")
+            raise file.fault(f"its {key} is {shown(document.get(key))}, expected a positive number")
     return {
         "n_vertices": n_vertices, "sh_degree": degree, "origin": origin,
         "size": document["size"], "density_scale": document["density_scale"],
@@ -218,4 +228,4 @@ def _bounded(values: np.ndarray, bound: float = LARGEST_VALUE) -> bool:
 
 
 def _is_number(value: Any, low: float, high: float) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and low <= value <= high
+    return type(value) in (int, float) and low <= value <= high  # false for NaN; true numbers of any length compare

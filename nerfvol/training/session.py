@@ -105,7 +105,9 @@ class Run:
         self, config: Config, data: Data, clock: Clock, saved: dict[str, Any] | None, say: Say = print
     ) -> None:
         self.given = config
-        self.config = config.for_scene(data.training.scene).before(data.training.backdrop)
+        sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in data.training.cameras)
+        suited = config.for_scene(data.training.scene).for_pictures(sides[len(sides) // 2])
+        self.config = suited.before(data.training.backdrop)
         self.background: tuple[float, float, float] = self.config.background or WHITE
         self.data, self.clock, self.say = data, clock, say
         self.folder = Path(config.out)
