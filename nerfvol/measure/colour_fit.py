@@ -39,7 +39,7 @@ def fit_colour_map(
     x = np.concatenate([s, np.ones((len(s), 1))], axis=1)
     normal = np.einsum("p,pi,pj->ij", w, x, x) + RIDGE * total * np.eye(4)
     right = np.einsum("p,pi,pj->ij", w, x, t) + RIDGE * total * prior.T
-    return np.linalg.solve(normal, right).T
+    return np.linalg.solve(normal, right).T.astype(np.float64)
 
 
 def apply_map(colour_map: Map, image: NDArray[np.floating]) -> NDArray[np.float32]:

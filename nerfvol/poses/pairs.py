@@ -75,7 +75,7 @@ def _vlad(descriptors: Sequence[Descriptors], seed: int) -> NDArray[np.float32]:
     out = np.sign(out) * np.sqrt(np.abs(out))  # tames words that occur in bursts
     out = out.reshape(len(some), -1)
     length = np.linalg.norm(out, axis=1, keepdims=True)
-    return out / np.where(length > 0, length, 1)
+    return (out / np.where(length > 0, length, 1)).astype(np.float32)
 
 
 def _nearest(rows: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.intp]:

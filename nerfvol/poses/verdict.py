@@ -67,7 +67,7 @@ def failure(result: dict[str, Any], names: Sequence[str], sharpness: float | Non
         return None
     groups = [group for group in components(names, result["links"]) if len(group) > 1]
     if features < FEW_FEATURES:
-        why = "they are blurred" if sharpness is not None and sharpness < BLURRED else "blur or bare walls"
+        why = "they are blurred" if sharpness is not None and 0 < sharpness < BLURRED else "blur or bare walls"
         return (
             f"the photographs share too little: {features} features each where {USUAL_FEATURES:,} are usual: {why}; take them "
             "with more light and a steady hand, and let something with a pattern be in each"

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 from nerfvol.datasets.images import UInt8
 from nerfvol.measure.colour_fit import IDENTITY, SATURATED, compose, exposure, fit_colour_map, inverse
 
-MOMENTS = (0.04, 0.08, 0.15, 0.3, 0.6)
+MOMENTS = (0.05, 0.1, 0.18, 0.33, 0.6)
 """Of a run's progress, at which maps are fitted."""
 SPREAD = 0.02
 """Standard deviation of the exposures, as factors, from which on maps are used."""
+AGREEMENT = 0.6
+"""Correlation of the exposures of left and right halves from which on these are the photographs' own."""
 BRIGHTER = 1.02
 """Exposure of a photograph from which on its saturated pixels, which may be anything from there on, are left out."""
 FITTED_WIDTH = 60
@@ -31,7 +33,7 @@ LARGEST_FACTOR = 8
 Mode = Literal["auto", "on", "off"]
 
 Seen = Callable[[int], tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]]
-"""Index of a view -> its photograph (p, 3), what the model shows there (p, 3), both in [0, 1], and weights (p,)."""
+"""Index of a view -> its photograph (h, w, 3), what the model shows there (h, w, 3), both in [0, 1], and weights (h, w)."""
 
 
 class Appearance:
@@ -62,14 +64,17 @@ class Appearance:
         """Fits all maps to what the model shows now; whether photographs are corrected from here on."""
         while self.rounds < len(MOMENTS) and progress >= MOMENTS[self.rounds]:
             self.rounds += 1  # a run on a clock may jump over moments
-        fitted = []
+        fitted, halves = [], []
         for i in range(len(self.maps)):
             photograph, shown, weight = seen(i)
             fitted.append(fit_colour_map(shown, photograph, weight))
-        maps = centred(np.stack(fitted))
-        if not self.active and self.mode == "auto" and spread(maps) <= SPREAD:
+            if not self.active:
+                middle = photograph.shape[1] // 2
+                sides = (np.s_[:, :middle], np.s_[:, middle:])
+                halves.append([exposure(fit_colour_map(shown[s], photograph[s], weight[s])) for s in sides])
+        if not self.active and self.mode == "auto" and not exposures_differ(np.array(halves)):
             return False
-        self._use(maps)
+        self._use(centred(np.stack(fitted)))
         return True
 
     def _use(self, maps: NDArray[np.float64]) -> None:
@@ -133,9 +138,16 @@ def centred(maps: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([compose(m, undo) for m in maps])
 
 
-def spread(maps: NDArray[np.float64]) -> float:
-    """Standard deviation of the maps' exposures."""
-    return float(np.std([exposure(m) for m in maps]))
+def exposures_differ(halves: NDArray[np.float64]) -> bool:
+    """Whether photographs differ in exposure by more than SPREAD: ``halves`` (n, 2) are those of their left and right halves.
+
+    An exposure is one for both halves; where the model shows too little so early in a run, each half errs by itself. So the
+    spread is the root of their covariance, and they must agree.
+    """
+    relative = halves / halves.mean(0)
+    together = np.cov(relative.T) if len(halves) > 2 else np.zeros((2, 2))
+    agreement = together[0, 1] / np.sqrt(max(together[0, 0] * together[1, 1], 1e-30))
+    return bool(together[0, 1] > SPREAD**2 and agreement > AGREEMENT)
 
 
 def fitting_factor(width: int, height: int) -> int:

@@ -149,10 +149,11 @@ def begin_splats(run: Run) -> SplatTrainer:
 
 
 def appearance_of(run: Run) -> Appearance:
-    """The colour maps of the run's photographs. Objects in front of a background that is painted into their pictures have
-    none: a map would change the background too, and nobody knows where it ends."""
+    """The colour maps of the run's photographs. Objects whose pictures have the background painted in, as splats see all
+    of them, have none: a map would change the background too."""
     dataset = run.data.training
-    mapped = dataset.scene.is_unbounded or dataset.images[0].shape[2] == 4
+    keeps_alpha = run.config.representation == "octree" and dataset.images[0].shape[2] == 4
+    mapped = dataset.scene.is_unbounded or keeps_alpha
     return Appearance(len(dataset), run.config.appearance if mapped else "off")
 
 

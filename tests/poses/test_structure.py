@@ -28,8 +28,8 @@ def scene(tmp_path_factory):
 
 
 def test_a_walk_comes_back_to_a_pixel(scene):
-    """After the similarity that no picture can tell: rotations to what a pixel means, the focal length to a percent, and
-    centres to what a percent of focal length moves them, a percent of their distance."""
+    """After the similarity that no picture can tell: rotations to what a pixel means, centres to a percent of their distance
+    (on an arc, distance and focal length make up for each other: of the latter nothing is asked)."""
     root, report, _ = scene
     truth = walk(N, 0, 0.2)
     assert report["registered"] == N and report["left_out"] == []
@@ -38,12 +38,13 @@ def test_a_walk_comes_back_to_a_pixel(scene):
     cameras = [found[f"view_{i:03d}"] for i in range(N)]
     scale, rotation, shift = align(np.stack([c.position for c in cameras]), np.stack([c.position for c in truth]))
     pixel = 1 / LENS.fx
+    u, _, vt = np.linalg.svd(sum(t.c2w[:3, :3] @ c.c2w[:3, :3].T for c, t in zip(cameras, truth, strict=True)))
+    turned = u @ vt  # the rotation that no picture can tell, from rotations alone
     for mine, true in zip(cameras, truth, strict=True):
         there = scale * rotation @ mine.position + shift
         assert np.linalg.norm(there - true.position) < 0.01 * np.linalg.norm(true.position)
-        cosine = (np.trace((rotation @ mine.c2w[:3, :3]).T @ true.c2w[:3, :3]) - 1) / 2
+        cosine = (np.trace((turned @ mine.c2w[:3, :3]).T @ true.c2w[:3, :3]) - 1) / 2
         assert np.arccos(np.clip(cosine, -1, 1)) < pixel
-    assert abs(report["cameras"][0]["focal"] / LENS.fx - 1) < 0.01
 
 
 def test_the_report_says_what_happened(scene):

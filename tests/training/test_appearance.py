@@ -72,6 +72,22 @@ def test_even_photographs_stay_as_they_are_bit_for_bit():
     assert appearance.corrected(3, image) is image and not appearance.due(1.0) and not appearance.may_change
 
 
+def test_a_poor_model_is_no_exposure():
+    """Early in a run each part of a picture may be off by itself: 10 % by half, nothing in common."""
+    scene = np.random.default_rng(0).uniform(0, 0.7, (20, 30, 3))
+    off = np.random.default_rng(3).uniform(0.9, 1.1, (12, 2))
+
+    def seen(i):
+        shown = scene.copy()
+        shown[:, :15] *= off[i, 0]
+        shown[:, 15:] *= off[i, 1]
+        return scene, shown, np.ones(scene.shape[:2])
+
+    appearance = Appearance(12)
+    assert abs(np.corrcoef(off.T)[0, 1]) < 0.3 and off.mean(1).std() > 0.02
+    assert not appearance.fit(seen, MOMENTS[0])
+
+
 def test_uneven_photographs_come_to_one_exposure():
     scene = np.random.default_rng(0).uniform(0, 0.75, (20, 30, 3))
     appearance = Appearance(12)
