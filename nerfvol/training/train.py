@@ -36,7 +36,7 @@ from nerfvol.training.memory import OctreePlan, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.prepare import check_folder, load_data
-from nerfvol.training.session import Clock, Run, Say, read_saved
+from nerfvol.training.session import Clock, Run, Say, Watch, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
@@ -61,13 +61,16 @@ class Results:
     compared: str
 
 
-def train(config: Config, started: float | None = None, say: Say | None = None) -> Results | None:
+def train(
+    config: Config, started: float | None = None, say: Say | None = None, watch: Watch | None = None
+) -> Results | None:
     """One training run as ``config`` says, in the folder ``config.out``.
 
     Args:
         config: all settings; with ``resume`` the run goes on from its checkpoint.
         started: moment (``time.perf_counter``) at which the time budget begins; default: the start of the process.
         say: gets each sentence that a person should see; default: prints it.
+        watch: called after every step with the run, its phase and whether the step began a stage; must change nothing.
 
     Returns:
         what the run came to; None where a resumed run was finished already.
@@ -92,6 +95,7 @@ def train(config: Config, started: float | None = None, say: Say | None = None) 
             out.rmdir()
         raise
     run = Run(config, data, clock, saved, say)
+    run.watch = watch
     with run.interruptible(), run:
         phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
         optimise(run, phase)
@@ -161,6 +165,8 @@ def optimise(run: Run, phase: Phase) -> None:
                 run.enter_stage(phase)
             if run.checkpoint_due():
                 run.save(phase)
+            if run.watch is not None:
+                run.watch(run, phase, phase.stage != stage)
     if phase.stages_left:
         run.say(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
 
