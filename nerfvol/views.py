@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import importlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -36,6 +37,8 @@ _FAR, _SMALLEST, _LARGEST = 16.0, 2.0**-8, 2.0**20
 # Sides of the root cube from the origin, and sides in scene units, beyond which float32 loses digits that are seen.
 NEAREST = 1e-3
 """Of the extent of splats: what is nearer to a camera is not drawn, where the file says no more."""
+NOTEBOOK = "nerfvol.viewer.notebook"
+"""Makes what a notebook shows of a model; imported where one asks."""
 
 
 def render_image(
@@ -131,6 +134,11 @@ def depth_range(model: Model, cameras: Sequence[Camera]) -> tuple[float, float]:
     return max(near - 0.1 * (far - near), 0.0), far + 0.1 * (far - near)
 
 
+def notebook_html(model: Model) -> str:
+    """What a notebook shows of a model: the viewer's page, or a picture of what is too large for a cell."""
+    return importlib.import_module(NOTEBOOK).repr_html(model)
+
+
 class OctreeModel:
     """An octree as a model (models.Model). ``octree`` is the octree itself."""
 
@@ -171,6 +179,9 @@ class OctreeModel:
         """(2, 3) corners of the box around all leaves."""
         half, center = self.octree.leaf_sizes()[:, None] / 2, self.octree.leaf_centers()
         return np.stack([(center - half).min(axis=0), (center + half).max(axis=0)])
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self)
 
     def describe(self) -> dict[str, Any]:
         """Counts, leaves by level, the share of the root cube that leaves fill, their bounding box, bytes in memory."""
@@ -282,6 +293,9 @@ class SplatModel:
         low, high = (np.quantile(splats.means, q, axis=0) for q in (0.01, 0.99)) if splats.n else (0.0, 0.0)
         middle = ((splats.means >= low) & (splats.means <= high)).all(1)
         return splats.select(middle).aabb() if middle.any() else splats.aabb()
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self)
 
     def describe(self) -> dict[str, Any]:
         """Count, degree, mode, quantiles of opacity and of the longest scale, bounding box, bytes in memory."""

@@ -15,6 +15,7 @@ from nerfvol.cli.train import print_results
 from nerfvol.config.assemble import assemble
 from nerfvol.config.training import Config
 from nerfvol.errors import InputError
+from nerfvol.export import export_model
 
 SCENE = "showcase"
 VIEWS = 60
@@ -62,11 +63,14 @@ def run(options: DemoOptions) -> int:
     target = open_target(str(folder / "run"))
     scores = _score(target, scene, folder)
     video = _orbit(target, folder / "orbit.mp4")
+    page = folder / "scene.html"
+    export_model(target.model, page)
     print(
         f"\nDone in {time.perf_counter() - started:.0f} s: PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.4f} on "
         f"{scores['n_images']} views that were held out, {scores['seconds_per_frame']:.3f} s per frame\n"
         f"  pictures  {folder / 'comparison.png'} (truth | render | error | depth); all: {folder / 'pictures'}\n"
         f"  video     {video}\n"
+        f"  page      {page} ({page.stat().st_size / 1e6:.0f} MB; a double click opens it in the browser)\n"
         f"  scores    {folder / 'scores.json'}\n"
         f"  model     {target.path} ({target.path.stat().st_size / 1e6:.0f} MB)"
     )

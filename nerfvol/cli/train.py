@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "differ by more than 2 %% (default: auto)")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
+    p.add_argument("--view", action="store_true", help="show the model in the browser while it is trained, a new one after "
+                   "each stage and every 20 s; the encoding takes a share of one core")  # fmt: skip
     p.add_argument("--resume", action="store_true", help="go on from RUN's checkpoint; settings come from RUN")
     p.add_argument("--checkpoint-every", metavar="TIME", help="the most a crash can cost (default: 30s)")
     p.add_argument("--storage", metavar="compact|float16|float32|mapped", help="how the model's file holds its values "
@@ -60,7 +63,7 @@ def run(given: dict[str, Any]) -> int:
     Raises:
         InputError: no such data, settings that do not fit, a run that cannot be resumed, or one that fails (see train.train).
     """
-    base = None
+    base, view = None, bool(given.pop("view", False))
     if given.get("resume") and given.get("out"):
         from nerfvol.training.prepare import resumable_config
 
@@ -75,10 +78,43 @@ def run(given: dict[str, Any]) -> int:
     go_on_without_reader()
     from nerfvol.training.train import train
 
+    if view:
+        return _run_viewed(config)
     results = train(config)
     if results is not None:
         print_results(results)
     return 0
+
+
+def _run_viewed(config: Config) -> int:
+    """Train with a viewer that stays, once the training is over, until Ctrl-C."""
+    import threading
+
+    from nerfvol.cli.view import announce
+    from nerfvol.datasets.load import load_dataset
+    from nerfvol.models import load_model
+    from nerfvol.training.train import train
+    from nerfvol.viewer.live import Live
+    from nerfvol.viewer.server import ViewServer
+    from nerfvol.viewer.shown import Shown
+
+    shown = Shown(Path(config.out).name)
+    server, live = ViewServer(shown), Live(shown)
+    try:
+        announce(server, True)
+        server.start()
+        results = train(config, watch=live)
+        if results is not None:
+            print_results(results)
+            live.join()
+            shown.dataset = load_dataset(config.data, "train", config.downscale)
+            shown.publish(load_model(results.model), "Training is over; load again for the photographs")
+            print(f"the viewer stays at {server.address} until Ctrl-C", flush=True)
+            with contextlib.suppress(KeyboardInterrupt):
+                threading.Event().wait()
+        return 0
+    finally:
+        server.close()
 
 
 def print_results(results: Results) -> None:

@@ -34,6 +34,7 @@ from nerfvol.views import OctreeModel, depth_range
 POSTER_SIZE = (1120, 630)
 POSTER_BYTES = 60_000
 ENGINE = ("engine.js", "worker.js")
+REMOTE = "remote.js"
 PAGE = ("engine.js", "camera.js", "draw.js", "view.js")
 
 
@@ -112,12 +113,11 @@ def poster(model: Model, settings: Mapping[str, Any]) -> str:
     return "data:image/webp;base64," + base64.b64encode(data.getvalue()).decode()
 
 
-def build_page(
-    settings: Mapping[str, Any], poster_address: str, model: bytes | None, extra: tuple[str, ...] = ()
-) -> str:
-    """The page's text. model: the file in it, compact; None: it comes from a server, by the scripts ``extra``."""
+def build_page(settings: Mapping[str, Any], poster_address: str, model: bytes | None) -> str:
+    """The page's text. model: the file in it, compact; None: it comes from the page's server (viewer/server.py)."""
+    before, last = PAGE[:-1], PAGE[-1]
+    names = (*before, last) if model is not None else (*before, REMOTE, last)
     script = "const remote = null;\n" if model is not None else ""
-    names = (*PAGE[:-1], *extra, PAGE[-1])
     script += "\n".join(resource(name).decode().replace('"use strict";', "") for name in names)
     script = f'"use strict";\n{script}'
     style = resource("style.css").decode()

@@ -44,8 +44,9 @@ def encode(splats: Splats) -> tuple[dict[str, Bytes], dict[str, Any]]:
     """Byte planes by name, and the JSON-able parameters that :func:`decode` needs. The order of the splats changes."""
     means = splats.means.astype(np.float64)
     low, high = (np.quantile(means, q, axis=0) for q in (0.1, 0.9)) if splats.n else (np.zeros(3), np.ones(3))
-    middle = ((low + high) / 2).astype(np.float32).astype(np.float64)
-    extent = float(np.float32(max(float((high - low).max()) / 2, 1e-9)))
+    # rounded, so that what was decoded is encoded to the same codes
+    extent = 2.0 ** np.rint(np.log2(max(float((high - low).max()) / 2, 1e-9)))
+    middle = np.rint((low + high) / 2 / extent * 4) * extent / 4
     curve = np.arcsinh((means - middle) / extent) / POSITION_STEP
     position = np.clip(np.rint(curve), -(1 << 22), (1 << 22) - 1).astype(np.int64)
     order = np.argsort(morton((position >> 3) + (1 << 19)), kind="stable")
@@ -54,13 +55,13 @@ def encode(splats: Splats) -> tuple[dict[str, Bytes], dict[str, Any]]:
     steps = np.where(np.arange(part.sh.shape[2]) == 0, DC_STEP, SH_STEP).astype(np.float32)
     columns = [
         *(position // FINE).T, *(position % FINE).T, *(part.log_scales / SCALE_STEP).T,
-        *(rotation_vectors(part.quats) / ROTATION_STEP).T,
+        *_rotation_codes(part.quats).T,
         np.clip(part.logits, -LARGEST_LOGIT, LARGEST_LOGIT) / LOGIT_STEP,
-        *(grey / steps).transpose(0, 2, 1).reshape(-1, part.n),
+        *(grey / steps).transpose(0, 2, 1).reshape(3 * len(steps), part.n),
     ]  # fmt: skip
     packed = [pack_codes(round_codes(np.asarray(column))) for column in columns]
     parameters = {
-        "position_step": POSITION_STEP, "middle": middle.tolist(), "extent": extent, "scale_step": SCALE_STEP,
+        "position_step": POSITION_STEP, "middle": middle.tolist(), "extent": float(extent), "scale_step": SCALE_STEP,
         "rotation_step": ROTATION_STEP, "logit_step": LOGIT_STEP, "dc_step": float(DC_STEP), "sh_step": float(SH_STEP),
         "differences": [int(differences) for differences, _ in packed],
     }  # fmt: skip
@@ -108,6 +109,14 @@ def decode(
         "logits": channel(12) * np.float32(step["logit_step"]),
         "sh": np.ascontiguousarray(np.einsum("ac,akn->nck", TO_GREY, grey)),
     }
+
+
+def _rotation_codes(quats: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Rounded to nearest, but never to more than half a turn, which would be another vector's."""
+    exact = rotation_vectors(quats) / ROTATION_STEP
+    codes = np.rint(exact)
+    beyond = np.linalg.norm(codes, axis=1) * ROTATION_STEP > np.pi
+    return np.where(beyond[:, None], np.trunc(exact), codes)
 
 
 def rotation_vectors(quats: NDArray[np.float32]) -> NDArray[np.float64]:

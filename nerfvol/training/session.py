@@ -52,6 +52,8 @@ _STATE = {
 
 
 Say = Callable[[str], object]
+Watch = Callable[["Run", Phase, bool], object]
+"""Sees a run, its phase after a step, and whether that step began a stage."""
 
 
 class Clock:
@@ -118,6 +120,7 @@ class Run:
         self.steps: dict[str, int] = self.saved["steps"]
         self.phase_started, self.running = 0.0, math.nan
         self.interrupted = False
+        self.watch: Watch | None = None
         self._claimed = saved is not None
         self._log: BinaryIO | None = None
         self._entered = False  # a phase, without a step since

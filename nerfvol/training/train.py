@@ -41,7 +41,7 @@ from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
-from nerfvol.training.session import Clock, Run, Say, read_saved
+from nerfvol.training.session import Clock, Run, Say, Watch, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
@@ -69,7 +69,11 @@ class Results:
 
 
 def train(
-    config: Config, started: float | None = None, say: Say | None = None, bar: MakeBar | None = None
+    config: Config,
+    started: float | None = None,
+    say: Say | None = None,
+    bar: MakeBar | None = None,
+    watch: Watch | None = None,
 ) -> Results | None:
     """One training run as ``config`` says, in the folder ``config.out``.
 
@@ -78,6 +82,7 @@ def train(
         started: moment (``time.perf_counter``) at which the time budget begins; default: the start of the process.
         say: gets each sentence that a person should see; default: prints it.
         bar: makes what shows the progress of a phase, from its name and what is done of it; default: :func:`progress_bar`.
+        watch: called after every step with the run, its phase and whether the step began a stage; must change nothing.
 
     Returns:
         what the run came to; None where a resumed run was finished already.
@@ -91,14 +96,16 @@ def train(
     out = check_folder(config)
     try:
         with only_writer(out, "trains"):
-            return _train(config, out, started, say, bar)
+            return _train(config, out, started, say, bar, watch)
     except InputError:
         with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays
             out.rmdir()
         raise
 
 
-def _train(config: Config, out: Path, started: float | None, say: Say, bar: MakeBar | None) -> Results | None:
+def _train(
+    config: Config, out: Path, started: float | None, say: Say, bar: MakeBar | None, watch: Watch | None
+) -> Results | None:
     saved = read_saved(out / run_folder.CHECKPOINT) if config.resume else None
     if saved is not None and saved["phase"] == "done":
         say(f"{out} is finished ({saved['steps']} steps), there is nothing to resume; its settings can be run again "
@@ -108,6 +115,7 @@ def _train(config: Config, out: Path, started: float | None, say: Say, bar: Make
     data = load_data(config, say)
     require_same(saved, data, out / run_folder.CHECKPOINT)
     run = Run(config, data, clock, saved, say)
+    run.watch = watch
     with run.interruptible(), run:
         phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
         optimise(run, phase, bar)
@@ -194,6 +202,8 @@ def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
                 run.enter_stage(phase)
             if run.checkpoint_due():
                 run.save_if_possible(phase)
+            if run.watch is not None:
+                run.watch(run, phase, phase.stage != stage)
     if phase.stages_left:
         run.say(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
 

@@ -51,6 +51,15 @@ async function open() {
   drawing.onpicture = shown;
   await drawing.open($("worker").textContent, module, bytes, count);
   changed();
+  if (!remote) return;
+  const distance = (m) => Math.max(norm(sub([m[0][3], m[1][3], m[2][3]], first.pivot)), 1e-6);
+  remote.build($("remote"), { look, path: pathNow, distance }).catch((error) => fault(error.message));
+  remote.follow(async (newer) => {
+    drawing.isSplats = readArrays(newer).document.format === "nerfvol splats";
+    model = newer;
+    await drawing.load(module, newer);
+    drawing.request(state.camera, state.background);
+  });
 }
 
 function shown(frame) {

@@ -11,9 +11,8 @@ from nerfvol.cameras.paths import load_cameras
 from nerfvol.export.page import first_camera, write
 from nerfvol.files.page import OPENING
 from nerfvol.models import load_model
-
-from .browser import DRAWN, launch, wait
-from .scenes import ball, cloud_of_splats
+from tests.viewer.browser import DRAWN, launch, wait
+from tests.viewer.scenes import ball, cloud_of_splats
 
 WIDTH, HEIGHT = 480, 320
 
@@ -262,3 +261,46 @@ def test_it_fits_a_narrow_screen(browser, files):
     assert wide == [] and page.evaluate("document.documentElement.scrollWidth") <= 360
     assert page.evaluate("document.getElementById('canvas').clientWidth") == 360
     page.close()
+
+
+def test_a_served_page_jumps_to_photographs_and_follows_a_new_model(browser):
+    from nerfvol.viewer.server import ViewServer
+    from nerfvol.viewer.shown import Shown
+    from tests.viewer.test_server import dataset_of
+
+    model = ball(0, 4)
+    shown = Shown("ball", dataset_of(model))
+    shown.publish(model)
+    server = ViewServer(shown, port=0)
+    server.start()
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    try:
+        page.goto(server.address)
+        wait(page, f"{DRAWN} && document.getElementById('photos')")
+        assert page.evaluate("crossOriginIsolated")
+        page.click("#menu")
+        page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+        page.select_option("#photos", "1")
+        wait(page, "!document.getElementById('error').hidden")
+        camera_there = shown.dataset.cameras[1]
+        assert np.allclose(camera(page)["position"], camera_there.position, atol=1e-9)
+        assert np.allclose(axes(camera(page)), camera_there.c2w[:3, :3].T, atol=1e-9)
+        assert page.inner_text("#score").startswith("b: PSNR ")
+        before = camera(page)
+        shown.publish(cloud_of_splats(1), "step 7")  # of another kind even
+        wait(page, "document.getElementById('live').textContent === 'step 7' && nerfvol.drawing.isSplats")
+        wait(page, DRAWN)
+        assert np.allclose(camera(page)["position"], before["position"])
+        page.focus("#canvas")
+        page.keyboard.press("k")
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("k")
+        page.evaluate("(nerfvol.state.keys[0].seconds = 0.2)")
+        for name, value in (("width", "64"), ("height", "48")):
+            page.fill(f"#{name}", value)
+        page.click("#film")
+        wait(page, "document.querySelector('#filmed a')")
+        assert server.video.state()["done"] == 6
+    finally:
+        page.close()
+        server.close()

@@ -14,8 +14,7 @@ from nerfvol.export.page import resource
 from nerfvol.export.page_size import stored
 from nerfvol.models import load_model
 from nerfvol.native import native
-
-from .scenes import ball, cloud_of_splats
+from tests.viewer.scenes import ball, cloud_of_splats
 
 ROOT = Path(__file__).resolve().parents[2]
 CSRC = ROOT / "nerfvol" / "kernels" / "csrc"
