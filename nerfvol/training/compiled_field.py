@@ -37,6 +37,7 @@ PROBE_EVERY, PROBES = 32, 32768
 SLOW_LEVELS, SLOW_EVERY = 3, 2
 """Levels of the grid from this one on are moved at every second step, by the gradient of both: half the work of Adam."""
 NETWORK_DECAY = 1e-6
+EPS = 1e-15
 WARM_UP = 20
 """Steps over which the rate rises."""
 
@@ -194,7 +195,7 @@ class CompiledFieldTrainer:
         warm = min(1.0, (self.steps_done + 1) / WARM_UP)
         decay = config.rate_decay ** max(0.0, (progress - 1 / 3) * 1.5)
         table_decay = config.few_decay if self.few else config.table_decay
-        return FieldRates(config.rate * warm * decay, table_decay=table_decay, network_decay=NETWORK_DECAY)
+        return FieldRates(config.rate * warm * decay, eps=EPS, table_decay=table_decay, network_decay=NETWORK_DECAY)
 
     def _look(self) -> None:
         """Look at cells that samples may not have been in, so that empty ones are found and space can come back."""

@@ -39,7 +39,8 @@ def test_levels_grow_geometrically_and_are_dense_where_they_fit() -> None:
     g = HashGrid(n_levels=5, n_features=2, log2_table=12, n_min=4, n_max=64)
     assert g.resolutions == [4, 8, 16, 32, 64]
     assert g.n_dense == 2  # 5**3 and 9**3 fit into 4096 entries, 17**3 = 4913 does not
-    assert g.table.shape == (125 + 729 + 3 * 4096, 2)
+    # Each level begins at a whole brick of 16 entries.
+    assert g.table.shape == (128 + 736 + 3 * 4096, 2) and g.starts == [0, 128, 864, 4960, 9056]
     assert HashGrid(n_levels=1, n_min=7, n_max=7).resolutions == [7]
 
 
@@ -53,7 +54,7 @@ def test_a_dense_level_reproduces_a_trilinear_function() -> None:
 
     axis = torch.arange(7, dtype=torch.float64) / 6
     vertices = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
-    g.table.data[:, 0] = f(vertices)
+    g.table.data[: len(vertices), 0] = f(vertices)
     p = torch.cat([points(200), vertices, torch.tensor([[-1.0, 0.5, 0.5], [2.0, 3.0, -4.0]], dtype=torch.float64)])
     torch.testing.assert_close(g(p)[:, 0], f(p.clamp(0, 1)), rtol=0, atol=1e-12)
 
@@ -76,8 +77,9 @@ def test_hashed_levels_match_the_definition() -> None:
                 if level < g.n_dense:
                     entry = (vertex[0] * (n + 1) + vertex[1]) * (n + 1) + vertex[2]
                 else:
-                    mixed = vertex[0] ^ (vertex[1] * 2654435761) ^ (vertex[2] * 805459861)
-                    entry = (mixed & 0xFFFFFFFF) % 1024
+                    x, y, z = vertex
+                    mixed = (x // 2) ^ (y // 2 * 2654435761) ^ (z // 4 * 805459861)
+                    entry = (mixed & 0xFFFFFFFF) % 64 * 16 + x % 2 * 8 + y % 2 * 4 + z % 4
                 columns = slice(level * 3, level * 3 + 3)
                 expected[i, columns] += weight * g.table.data[g.starts[level] + entry]
     torch.testing.assert_close(g(p).detach(), expected, rtol=0, atol=1e-12)

@@ -1,3 +1,3 @@
 """What tests of the kernels share."""
 
-from tests.fixtures.kernels import isa, threads  # noqa: F401  (fixtures)
+from tests.fixtures.kernels import compiled, isa, threads  # noqa: F401  (fixtures)
