@@ -73,7 +73,8 @@ def read_points(path: str | os.PathLike[str]) -> PointCloud:
         for name in ("x", "y", "z"):
             if name not in table:
                 raise file.fault(f"its vertices have no property {name!r}")
-        positions = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
+        with np.errstate(invalid="ignore"):  # what is no number is refused below
+            positions = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
         if not (np.abs(positions) < _FARTHEST).all():  # fails for what is no number as well
             bad = int((~(np.abs(positions) < _FARTHEST)).any(axis=1).argmax())
             raise file.fault(f"the position of point {bad} is not finite or beyond {_FARTHEST:g}")
