@@ -1,5 +1,6 @@
 """Frames drawn by several processes, in parts or after a kill are the bytes that one process draws at once."""
 
+import json
 import shutil
 
 import pytest
@@ -87,6 +88,19 @@ def test_workers_of_a_cluster_make_the_same_bytes(tmp_path, models, command):
     assert command(*splats, "--out", tmp_path / "here.gif")[0] == 0
     assert command(*splats, "--out", tmp_path / "there.gif", "--cluster", "local:2")[0] == 0
     assert (tmp_path / "there.gif").read_bytes() == (tmp_path / "here.gif").read_bytes()
+
+
+def test_scores_from_workers_are_those_from_here(tmp_path, models, tiny_scene, command):
+    pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
+    records = {}
+    for name, more in (("here", ()), ("there", ("--cluster", "local:2"))):
+        images, record = tmp_path / name, tmp_path / f"{name}.json"
+        given = ("--data", tiny_scene, "--save-images", images, "--json", record, "--split", "train")
+        assert command("eval", models / "octree.safetensors", *given, *more)[0] == 0
+        records[name] = json.loads(record.read_text())
+    here, there = ([row | {"seconds": 0} for row in records[name]["rows"]] for name in ("here", "there"))
+    assert len(here) > 3 and here == there and records["here"]["psnr"] == records["there"]["psnr"]
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
 
 
 def test_an_engine_that_is_not_there_is_one_sentence(tmp_path, models, command):
