@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,13 @@ from nerfvol.cameras.paths import cameras_document
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 from nerfvol.files import pictures
-from nerfvol.files.atomic import write_json
+from nerfvol.files.atomic import read_json, write_bytes, write_json
 from nerfvol.kernels.state import OUTPUTS
 from nerfvol.models import Model
 from nerfvol.views import depth_range, surface_depth, unit_normal
 
 Float = NDArray[np.float32]
+Suffix = Literal["png", "exr"]
 
 
 @dataclass(frozen=True)
@@ -41,42 +43,87 @@ class Film:
     output: str = "rgb"
     compare: Model | None = None
 
-    def together(self) -> Iterator[tuple[dict[str, Float], ...]]:
-        """:meth:`frames` of the model and, where there is one, of the one that it is compared with."""
-        films = [self] if self.compare is None else [self, replace(self, model=self.compare, compare=None)]
-        return zip(*(film.frames() for film in films), strict=True)
+    def drawn(self, camera: Camera) -> tuple[dict[str, Float], ...]:
+        """One view, of the model and, where there is one, of the model that it is compared with; by the names of outputs.
 
-    def shown(self, name: str, images: Sequence[Mapping[str, Float]], depths: tuple[float, float]) -> Float:
-        """The output ``name`` of each of ``images``, side by side (:func:`displayable`)."""
-        panels = [displayable(name, image, depths) for image in images]
-        return panels[0] if len(panels) == 1 else pictures.side_by_side(panels)
-
-    def frames(self) -> Iterator[dict[str, Float]]:
-        """The pictures in order, float32 by name: rgb and normal (H, W, 3), others (H, W).
-
-        Depth is the mean distance of what a pixel sees, scene units; normals have unit length. The opacity that it takes to
-        show what was asked for is there too.
+        float32, rgb and normal (H, W, 3), others (H, W). Depth is the mean distance of what a pixel sees, scene units; normals
+        have unit length. The opacity that it takes to show what was asked for is there too.
         """
+        models = [self.model] if self.compare is None else [self.model, self.compare]
+        return tuple(self._drawn(model, camera) for model in models)
+
+    def _drawn(self, model: Model, camera: Camera) -> dict[str, Float]:
         wanted = {"rgb"}
         for name in (self.output, *self.aov):
             wanted |= {"depth": {"depth", "opacity"}, "normal": {"normal", "opacity"}}.get(
                 name, {name} if name == "rgb" else {name, "opacity"}
             )
         outputs = [name for name in OUTPUTS if name in wanted]
-        for index, camera in enumerate(self.cameras):
-            if sys.stderr.isatty():
-                print(f"\rview {index + 1}/{len(self.cameras)}", end="", file=sys.stderr, flush=True)
-            image = self.model.render(camera, self.background, outputs, self.early_stop_eps, self.lod)
-            if "depth" in (self.output, *self.aov):
-                image["depth"] = surface_depth(image)
-            if "normal" in (self.output, *self.aov):
-                image["normal"] = unit_normal(image)
-            yield image
+        image = model.render(camera, self.background, outputs, self.early_stop_eps, self.lod)
+        if "depth" in (self.output, *self.aov):
+            image["depth"] = surface_depth(image)
+        if "normal" in (self.output, *self.aov):
+            image["normal"] = unit_normal(image)
+        return image
+
+    def shown(self, name: str, images: Sequence[Mapping[str, Float]], depths: tuple[float, float]) -> Float:
+        """The output ``name`` of each of ``images``, side by side (:func:`displayable`)."""
+        panels = [displayable(name, image, depths) for image in images]
+        return panels[0] if len(panels) == 1 else pictures.side_by_side(panels)
+
+    def files(self, camera: Camera, depths: tuple[float, float], suffix: Suffix) -> dict[str, bytes]:
+        """The files of one view by the end of their names: PNG with one more for each AOV, or EXR with everything.
+
+        ``depths``: nearest and farthest that pictures of depth show, scene units.
+        """
+        images = self.drawn(camera)
+        if suffix == "exr":
+            image = images[0]
+            channels = {"RGB": pictures.srgb_to_linear(image["rgb"])}
+            exr_names = {"opacity": "A", "depth": "Z", "median_depth": "median.Z", "normal": "N"}
+            channels.update({exr_names[aov]: image[aov] for aov in self.aov})
+            return {".exr": pictures.encode_exr(channels)}
+        names = {".png": self.output, **{f"_{aov}.png": aov for aov in self.aov}}
+        return {end: pictures.encode_png(self.shown(name, images, depths)) for end, name in names.items()}
+
+    def video_frames(self, camera: Camera, depths: tuple[float, float]) -> dict[str, NDArray[np.uint8]]:
+        """What videos show of one view: (H, W, 3) by the names of output and AOVs."""
+        images = self.drawn(camera)
+        out = {}
+        for name in (self.output, *self.aov):
+            shown = pictures.to_uint8(self.shown(name, images, depths))
+            out[name] = shown if shown.ndim == 3 else np.repeat(shown[..., None], 3, axis=2)
+        return out
+
+    def depths(self) -> tuple[float, float]:
+        """What pictures of depth are scaled by, the same for all views."""
+        return depth_range(self.model, self.cameras)
+
+
+T = TypeVar("T")
+Each = Callable[[Callable[[Camera], T], Sequence[Camera]], Iterator[T]]
+"""How views are drawn: a function of a camera, the cameras -> its results in order. Here one after the other; workers of a
+cluster do the same (nerfvol.cluster.frames)."""
+
+
+def one_by_one(draw: Callable[[Camera], T], cameras: Sequence[Camera]) -> Iterator[T]:
+    """The views in turn."""
+    return with_progress(map(draw, cameras), len(cameras))
+
+
+def with_progress(results: Iterator[T], n: int) -> Iterator[T]:
+    """``results``, whose number stands on the terminal with the time that is left, if there is a terminal."""
+    started = time.perf_counter()
+    for done, result in enumerate(results, 1):
         if sys.stderr.isatty():
-            print("\r", end="", file=sys.stderr)
+            left = (time.perf_counter() - started) / done * (n - done)
+            print(f"\rview {done}/{n}, {left:.0f} s left ", end="", file=sys.stderr, flush=True)
+        yield result
+    if sys.stderr.isatty():
+        print("\r\033[K", end="", file=sys.stderr)
 
 
-def write_videos(path: Path, film: Film, fps: float) -> list[Path]:
+def write_videos(path: Path, film: Film, fps: float, each: Each | None = None) -> list[Path]:
     """One video of what the film shows at ``path`` and one for each AOV next to it; returns their paths.
 
     Raises:
@@ -85,14 +132,13 @@ def write_videos(path: Path, film: Film, fps: float) -> list[Path]:
     if len(sizes := {(c.intrinsics.width, c.intrinsics.height) for c in film.cameras}) > 1:
         listed = " and ".join(f"{w}x{h}" for w, h in sorted(sizes)[:2])
         raise InputError(f"the frames of a video have one size, these cameras have {listed}: give --size WxH")
-    depths = depth_range(film.model, film.cameras)
+    depths = film.depths()
     paths = {film.output: path, **{name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in film.aov}}
     with contextlib.ExitStack() as stack:
         writers = {name: stack.enter_context(pictures.open_video(p, fps)) for name, p in paths.items()}
-        for images in film.together():
+        for frames in (each or one_by_one)(lambda camera: film.video_frames(camera, depths), film.cameras):
             for name, writer in writers.items():
-                shown = film.shown(name, images, depths)
-                writer.add(shown if shown.ndim == 3 else np.repeat(shown[..., None], 3, axis=2))
+                writer.add(frames[name])
     return list(paths.values())
 
 
@@ -124,34 +170,78 @@ def write_picture(path: Path, film: Film) -> list[Path]:
         raise InputError(
             f"{path} is one picture and there are {len(film.cameras)} views: give --out a folder or a video"
         )
-    depths = depth_range(film.model, film.cameras)
-    paths = {film.output: path, **{name: path.with_name(f"{path.stem}_{name}{path.suffix}") for name in film.aov}}
-    for images in film.together():
-        for name, place in paths.items():
-            pictures.write_png(place, film.shown(name, images, depths))
-    return list(paths.values())
+    depths = film.depths()
+    written = []
+    for end, data in film.files(film.cameras[0], depths, "png").items():
+        written.append(path.with_name(path.stem + end[:-4] + path.suffix))
+        write_bytes(written[-1], data)
+    return written
 
 
-def write_pictures(out: Path, film: Film, suffix: Literal["png", "exr"] = "png") -> list[Path]:
-    """One picture a view in the folder ``out`` (PNG with one more for each AOV, or EXR with everything), and cameras.json."""
-    depths = depth_range(film.model, film.cameras)
-    digits = max(4, len(str(len(film.cameras) - 1)))
-    names = [f"{index:0{digits}d}" for index in range(len(film.cameras))]
+@dataclass(frozen=True)
+class Chosen:
+    """Which of a path's views are drawn: first, first + step, ... last; those whose files are there already are left."""
+
+    first: int
+    last: int
+    step: int = 1
+
+
+def write_pictures(
+    out: Path, film: Film, suffix: Suffix = "png", chosen: Chosen | None = None, each: Each | None = None, of: str = ""
+) -> int:
+    """Pictures of views in the folder ``out`` (:meth:`Film.files`), and cameras.json; returns how many views were drawn.
+
+    ``chosen``: draws these alone and leaves what is whole already, so that many processes can share a folder, and a killed one
+    goes on; None: all views, over what is there. ``of``: names what is drawn, a hash of model and settings; it is kept beside
+    the pictures, and a folder of another film is refused.
+
+    Raises:
+        InputError: views that the path does not have, pictures of another film, or a path that cannot be written.
+    """
     if suffix == "exr" and film.compare is not None:
         raise InputError("EXR pictures hold one model: compare in PNG or a video")
-    for name, images in zip(names, film.together(), strict=True):
-        if suffix == "exr":
-            image = images[0]
-            channels = {"RGB": pictures.srgb_to_linear(image["rgb"])}
-            exr_names = {"opacity": "A", "depth": "Z", "median_depth": "median.Z", "normal": "N"}
-            channels.update({exr_names[aov]: image[aov] for aov in film.aov})
-            pictures.write_exr(out / f"{name}.exr", channels)
-            continue
-        pictures.write_png(out / f"{name}.png", film.shown(film.output, images, depths))
-        for aov in film.aov:
-            pictures.write_png(out / f"{name}_{aov}.png", film.shown(aov, images, depths))
+    digits = max(4, len(str(len(film.cameras) - 1)))
+    names = [f"{index:0{digits}d}" for index in range(len(film.cameras))]
+    wanted = list(range(len(names)))
+    ends = [".exr"] if suffix == "exr" else [".png", *(f"_{aov}.png" for aov in film.aov)]
+    if chosen is None:
+        (out / RECORD).unlink(missing_ok=True)  # until all are of this film
+    else:
+        if chosen.last >= len(names):
+            raise InputError(f"--frames {chosen.first}-{chosen.last}: the path has the frames 0-{len(names) - 1}")
+        ours = _claim(out, of)
+        wanted = [k for k in wanted[chosen.first : chosen.last + 1 : chosen.step]
+                  if not (ours and all((out / f"{names[k]}{end}").is_file() for end in ends))]  # fmt: skip
+    depths = film.depths()
     document = cameras_document(film.cameras, [f"{name}.{suffix}" for name in names])
     if suffix == "png" and {"depth", "median_depth"} & {film.output, *film.aov}:
         document["depth_range"] = depths
     write_json(out / "cameras.json", document)
-    return [out]
+    made = (each or one_by_one)(lambda camera: film.files(camera, depths, suffix), [film.cameras[k] for k in wanted])
+    for k, files in zip(wanted, made, strict=True):
+        for end, data in files.items():
+            write_bytes(out / f"{names[k]}{end}", data)
+    if chosen is None:
+        _claim(out, of)
+    return len(wanted)
+
+
+RECORD = "film.json"
+"""What the pictures of a folder are of."""
+
+
+def _claim(out: Path, of: str) -> bool:
+    """Notes in ``out`` what its pictures are of; whether they were of it before. InputError where they are of something else."""
+    path = out / RECORD
+    if not path.is_file():
+        write_json(path, {"of": of})
+        return False
+    found = read_json(path)
+    if found != {"of": of}:
+        what = f"{found.get('of', '?')!s:.12}" if isinstance(found, dict) else "?"
+        raise InputError(
+            f"{out} holds pictures of another model, path or drawn otherwise ({RECORD} says {what}, this is {of:.12}): "
+            "choose another --out"
+        )
+    return True

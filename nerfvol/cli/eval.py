@@ -37,6 +37,7 @@ class EvalOptions:
     save_images: str | None = None
     truth: str | None = None
     lpips: bool = False
+    cluster: str | None = None
     threads: int = 0
 
 
@@ -55,6 +56,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
                    "(with --save-images: slices of both)")  # fmt: skip
     add_drawing(p)
+    p.add_argument("--cluster", metavar="WHERE", help="on the workers of an engine, which must see the data: local:N, "
+                   "tcp://host:8786 or a scheduler file; the same scores (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
 
 
 def run(options: EvalOptions) -> int:
@@ -95,9 +98,20 @@ def run(options: EvalOptions) -> int:
         for see in seers:
             see(index, truth, image)
 
-    scores = evaluate(target.model, dataset, *drawing, on_view if seers else None)
+    if options.cluster is None:
+        scores = evaluate(target.model, dataset, *drawing, on_view if seers else None)
+    else:
+        loaded = {
+            "data": data,
+            "split": options.split,
+            "downscale": options.downscale,
+            "holdout": holdout,
+            "scene": scene,
+        }
+        scores = _on_cluster(options.cluster, target, dataset, drawing, loaded, on_view if seers else None)
+    rows = {row["name"]: row for row in scores["rows"]}
     for index, value in distances.items():
-        scores["rows"][index]["lpips"] = value
+        rows[dataset.names[index]]["lpips"] = value
     record = _record(options, scores, target, str(data), dataset) | {"holdout": holdout}
     if distances:
         record |= {"lpips": statistics.fmean(distances.values()), "lpips_network": NETWORK}
@@ -110,6 +124,23 @@ def run(options: EvalOptions) -> int:
     if options.save_images is not None:
         print(f"pictures (truth | render | error | depth): {options.save_images}")
     return 0
+
+
+def _on_cluster(
+    where: str,
+    target: Target,
+    dataset: Dataset,
+    drawing: tuple[Any, float, float],
+    loaded: dict[str, Any],
+    on_view: Any,
+) -> dict[str, Any]:
+    from nerfvol.cluster.engine import connect
+    from nerfvol.cluster.views import evaluate
+
+    background, early_stop_eps, lod = drawing
+    settings = {"background": list(background), "early_stop_eps": early_stop_eps, "lod": lod, **loaded}
+    with connect(where) as client:
+        return evaluate(client, target.path, dataset, settings, lambda text: print(text, file=sys.stderr), on_view)
 
 
 def _compare_with_truth(target: Target, path: str, folder: str | None) -> dict[str, float]:

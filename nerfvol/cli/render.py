@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from nerfvol.cli.command import Command, add_drawing, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
-from nerfvol.config.values import Colour, Count, Size, above, aov_names, fraction, pixels
+from nerfvol.config.values import Colour, Count, Frames, Size, above, aov_names, fraction, frame_choice, pixels
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
+    from nerfvol.film import Chosen
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".webm", ".gif")
 
@@ -31,7 +34,7 @@ class RenderOptions:
     path: str | None = None
     cameras: str | None = None
     orbit: Count | None = None
-    frames: Count | None = None
+    frames: Annotated[Frames | None, frame_choice] = None
     seconds: Annotated[float, above(0, 3600)] | None = None
     loop: bool = False
     size: Size | None = None
@@ -45,6 +48,7 @@ class RenderOptions:
     early_stop_eps: Annotated[float, fraction] = DEFAULT_EARLY_STOP
     lod: Annotated[float, pixels] = DEFAULT_LOD
     composite: Literal["surface", "over"] | None = None
+    cluster: str | None = None
     threads: int = 0
 
 
@@ -55,8 +59,9 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "cameras stood, or a file: our JSON or that of nerfstudio, 3DGS or instant-ngp (docs/cli.md)")  # fmt: skip
     p.add_argument("--cameras", metavar="FILE.json", help="the same as --path FILE: each camera of the file a picture")
     p.add_argument("--orbit", metavar="N", help="the same as --path orbit --frames N")
-    p.add_argument("--frames", metavar="N", help="pictures; between the cameras of a file as a smooth path through them "
-                   "(default: 120 of a move, those of a file)")  # fmt: skip
+    p.add_argument("--frames", metavar="N|A-B[/S]", help="N pictures; between the cameras of a file as a smooth path through "
+                   "them (default: 120 of a move, those of a file). A-B/S: only each S-th from A to B of the path's, and of "
+                   "these those that are not there yet (docs/cluster.md)")  # fmt: skip
     p.add_argument("--seconds", metavar="S", help="in place of --frames: N = S x fps")
     p.add_argument("--fps", metavar="F", help="frames a second of a video (default: what the file says, or 30)")
     p.add_argument("--loop", action="store_true", help="the path through a file's cameras comes back to the first")
@@ -72,6 +77,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "depth are averaged first, so that neither gaps nor overlaps show; over: one almost opaque disc or ball "
                    "over the other, as viewers of splats draw them (default: surface)")  # fmt: skip
     add_drawing(p)
+    p.add_argument("--cluster", metavar="WHERE", help="draw on the workers of an engine: local:N, tcp://host:8786 or a scheduler "
+                   "file; the same bytes (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
 
 
 def run(options: RenderOptions) -> int:
@@ -84,10 +91,11 @@ def run(options: RenderOptions) -> int:
     _check_path_options(options)
     out, ending = Path(options.out), _ending(options)
     set_threads(options.threads)
+    from nerfvol.cluster.frames import COMPARED, MODEL, OnCluster, identity
     from nerfvol.film import Film, of_one_size, write_picture, write_pictures, write_videos
 
     target = open_target(options.target, options.background)
-    compare = open_target(options.compare, target.background).model if options.compare else None
+    compared = open_target(options.compare, target.background) if options.compare else None
     if options.composite is not None:
         target = _composited(target, options.composite)
     cameras, fps = _cameras(options, target)
@@ -108,17 +116,42 @@ def run(options: RenderOptions) -> int:
         options.early_stop_eps,
         options.lod,
         options.output,
-        compare,
+        compared and compared.model,
     )
     started = time.perf_counter()
-    if ending in VIDEO_ENDINGS:
-        written = write_videos(out, film, fps)
-    else:
-        written = write_picture(out, film) if ending else write_pictures(out, film, options.format)
+    files = {MODEL: target.path} | ({COMPARED: compared.path} if compared else {})
+    suffix = None if ending in VIDEO_ENDINGS else "png" if ending else options.format
+    with contextlib.ExitStack() as stack:
+        each = None
+        if options.cluster is not None:
+            from nerfvol.cluster.engine import connect
+
+            on_cluster = OnCluster(stack.enter_context(connect(options.cluster)), film, files, suffix=suffix)
+            for message in on_cluster.messages:
+                print(message, file=sys.stderr)
+            each = on_cluster
+        drawn, written = len(cameras), [out]
+        if ending in VIDEO_ENDINGS:
+            written = write_videos(out, film, fps, each)
+        elif ending:
+            written = write_picture(out, film)
+        else:
+            chosen = _chosen(options, len(cameras))
+            drawn = write_pictures(out, film, options.format, chosen, each, identity(film, files, suffix=suffix))
     seconds = time.perf_counter() - started
     where = ", ".join(map(str, written))
-    print(f"{len(cameras)} views in {seconds:.1f} s ({len(cameras) / seconds:.1f} a second): {where}")
+    there = f", {len(cameras)} in the path" if drawn != len(cameras) else ""
+    print(f"{drawn} views{there} in {seconds:.1f} s ({drawn / seconds:.1f} a second): {where}")
     return 0
+
+
+def _chosen(options: RenderOptions, n: int) -> Chosen | None:
+    """The views that are drawn where not all are: those asked for, or with a cluster those that are not there yet."""
+    from nerfvol.film import Chosen
+
+    if options.frames is not None and options.frames.count is None:
+        return Chosen(options.frames.first, options.frames.last, options.frames.step)
+    return Chosen(0, n - 1) if options.cluster is not None else None
 
 
 def _check_path_options(options: RenderOptions) -> None:
@@ -129,10 +162,17 @@ def _check_path_options(options: RenderOptions) -> None:
         )
     if len(given) > 1:
         raise InputError(f"--{given[0]} and --{given[1]} both say where the cameras are: give one of them")
-    if options.frames is not None and options.seconds is not None:
+    count = options.frames is not None and options.frames.count is not None
+    if options.frames is not None and not count and _ending(options):
+        raise InputError("--frames A-B draws pictures of a path: give --out a folder, not a video or one picture")
+    if count and options.seconds is not None:
         raise InputError("--frames and --seconds both say how many pictures there are: give one of them")
-    if options.orbit is not None and (options.frames, options.seconds) != (None, None):
+    if options.orbit is not None and (count or options.seconds is not None):
         raise InputError("--orbit N says how many pictures there are: use --path orbit with --frames or --seconds")
+
+
+def _count(options: RenderOptions) -> int | None:
+    return None if options.frames is None else options.frames.count
 
 
 def _ending(options: RenderOptions) -> str:
@@ -161,7 +201,7 @@ def _cameras(options: RenderOptions, target: Target) -> tuple[list[Camera], floa
     name = options.path or options.cameras or "orbit"
     if options.cameras is None and name in MOVES and not Path(name).is_file():
         fps = options.fps or 30.0
-        count = options.orbit or options.frames or round((options.seconds or 0) * fps) or 120
+        count = options.orbit or _count(options) or round((options.seconds or 0) * fps) or 120
         orbit = target.orbit()
         if "arc_deg" in orbit:
             print(f"the training cameras stood on one side: the path sways within their {orbit['arc_deg']:.0f} degrees")
@@ -171,7 +211,7 @@ def _cameras(options: RenderOptions, target: Target) -> tuple[list[Camera], floa
         raise InputError(f"unknown path {name!r}: expected {', '.join(MOVES)}, or a file")
     path = load_path(name, options.size)
     fps = options.fps or path.fps or 30.0
-    count = options.frames or (max(1, round(options.seconds * fps)) if options.seconds else None)
+    count = _count(options) or (max(1, round(options.seconds * fps)) if options.seconds else None)
     if count is None and path.keyframes:
         count = max(1, round((path.seconds or 4.0) * fps))
     cameras = path.cameras if count is None else interpolated(path.cameras, count, options.loop or path.loop)

@@ -297,6 +297,33 @@ def aov_names(value: Any) -> Any:
     return tuple(names)
 
 
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """Of a path: ``count`` pictures, or those from ``first`` to ``last`` in steps of ``step``."""
+
+    count: int | None = None
+    first: int = 0
+    last: int = 0
+    step: int = 1
+
+
+def frame_choice(value: Any) -> Any:
+    """Frames from "N", "A-B" or "A-B/S"; None stays. ValueError for others."""
+    if value is None or isinstance(value, Frames):
+        return value
+    match = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9})(?:/(\d{1,9}))?)?", str(value).strip(), re.ASCII)
+    if match is None:
+        raise ValueError(f"expected a number of frames, or the frames A-B or A-B/S of a path, got {shown(value)}")
+    first, last, step = (None if part is None else int(part) for part in match.groups())
+    if last is None:
+        if not first:
+            raise ValueError("expected at least one frame, got 0")
+        return Frames(count=first)
+    if last < (first or 0) or step == 0:
+        raise ValueError(f"expected the frames A-B/S with A up to B and S at least 1, got {shown(value)}")
+    return Frames(None, first or 0, last, step or 1)
+
+
 def fraction(value: Any) -> Any:
     """A number in [0, 1); ValueError for another."""
     number = _number(value)

@@ -51,8 +51,8 @@ def srgb_to_linear(image: Float) -> Float:
     return (np.sign(image) * curve).astype(np.float32)
 
 
-def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Float]) -> None:
-    """Write float32 ``channels`` to one EXR; "RGB" and "N" are (H, W, 3), the others (H, W), for example "A" and "Z".
+def encode_exr(channels: Mapping[str, Float]) -> bytes:
+    """An EXR of float32 ``channels``; "RGB" and "N" are (H, W, 3), the others (H, W), for example "A" and "Z".
 
     "N" becomes N.X, N.Y, N.Z. Uncompressed scan lines, the plainest kind of file that the OpenEXR format has
     (openexr.com, "OpenEXR File Layout"): no library is needed for it, and every reader takes it.
@@ -70,10 +70,13 @@ def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Float]) -> No
     row_bytes = rows[0].nbytes
     first = len(header) + 8 * len(rows)
     offsets = first + (8 + row_bytes) * np.arange(len(rows), dtype="<u8")
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(header + offsets.tobytes())
-        for number, row in enumerate(rows):
-            file.write(struct.pack("<ii", number, row_bytes) + row.tobytes())
+    lines = (struct.pack("<ii", number, row_bytes) + row.tobytes() for number, row in enumerate(rows))
+    return b"".join([header, offsets.tobytes(), *lines])
+
+
+def write_exr(path: str | os.PathLike[str], channels: Mapping[str, Float]) -> None:
+    """Write :func:`encode_exr` of ``channels`` to ``path``."""
+    write_bytes(path, encode_exr(channels))
 
 
 def _exr_header(names: list[str], width: int, height: int) -> bytes:

@@ -145,9 +145,7 @@ def loss_gradient(
     grads = dict(zip(named, torch.autograd.grad(total, list(named.values()), allow_unused=True), strict=True))
     table = grads.pop("encoding.table", None)
     table = torch.zeros(state.table.shape, dtype=dtype) if table is None else table
-    parts = [
-        torch.zeros(named[name].numel(), dtype=dtype) if g is None else g.reshape(-1) for name, g in grads.items()
-    ]
+    parts = [torch.zeros(named[name].numel(), dtype=dtype) if g is None else g.reshape(-1) for name, g in grads.items()]
     return table, torch.cat(parts), total.detach()
 
 

@@ -50,25 +50,10 @@ def score_views(
 
     def score(rendered: tuple[int, Float, float]) -> dict[str, Any]:
         index, image, seconds = rendered
-        truth = dataset.composited(index, background)
-        seen = _seen(dataset, index)
-        row = {
-            "name": dataset.names[index],
-            "psnr": min(psnr(image, truth) if seen is None else psnr(image[seen], truth[seen]), LARGEST_PSNR),
-            "ssim": ssim(image, truth, seen),
-            "seconds": seconds,
-        }
-        if colour_fit:
-            colours = fit_colour_map(image, truth) if seen is None else fit_colour_map(image[seen], truth[seen])
-            fitted = np.clip(apply_map(colours, image), 0, 1)
-            after = psnr(fitted, truth) if seen is None else psnr(fitted[seen], truth[seen])
-            row |= {"psnr_fitted": min(after, LARGEST_PSNR), "ssim_fitted": ssim(fitted, truth, seen)}
-        return row
+        return score_view(image, dataset, index, background, colour_fit) | {"seconds": seconds}
 
     rows, at_once = [], ops.get_threads()
-    scored = [i for i in range(len(dataset)) if (seen := _seen(dataset, i)) is None or seen.any()]
-    if not scored:
-        raise InputError(f"{dataset.source}: masks leave nothing of the images to score")
+    scored = scored_views(dataset)
     for first in range(0, len(scored), at_once):
         # A few views one after the other, for their times; then their scores side by side.
         few = []
@@ -81,7 +66,38 @@ def score_views(
         if on_view is not None:
             for index, image, _ in few:
                 on_view(index, dataset.composited(index, background), image)
-    means = ("psnr", "ssim", *(("psnr_fitted", "ssim_fitted") if colour_fit else ()))
+    return summarised(rows)
+
+
+def scored_views(dataset: Dataset) -> list[int]:
+    """The views that have something to score; InputError where none has."""
+    scored = [i for i in range(len(dataset)) if (seen := _seen(dataset, i)) is None or seen.any()]
+    if not scored:
+        raise InputError(f"{dataset.source}: masks leave nothing of the images to score")
+    return scored
+
+
+def score_view(
+    image: Float, dataset: Dataset, index: int, background: Sequence[float], colour_fit: bool
+) -> dict[str, Any]:
+    """One row of :func:`score_views` but for its seconds: of the render ``image`` (H, W, 3) in [0, 1] of view ``index``."""
+    truth, seen = dataset.composited(index, background), _seen(dataset, index)
+
+    def scores(of: Float) -> tuple[float, float]:
+        error = psnr(of, truth) if seen is None else psnr(of[seen], truth[seen])
+        return min(error, LARGEST_PSNR), ssim(of, truth, seen)
+
+    row: dict[str, Any] = {"name": dataset.names[index]}
+    row["psnr"], row["ssim"] = scores(image)
+    if colour_fit:
+        colours = fit_colour_map(image, truth) if seen is None else fit_colour_map(image[seen], truth[seen])
+        row["psnr_fitted"], row["ssim_fitted"] = scores(np.clip(apply_map(colours, image), 0, 1))
+    return row
+
+
+def summarised(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What :func:`score_views` returns of its rows."""
+    means = [name for name in ("psnr", "ssim", "psnr_fitted", "ssim_fitted") if name in rows[0]]
     return {
         **{name: statistics.fmean(row[name] for row in rows) for name in means},
         "seconds_per_frame": statistics.median(row["seconds"] for row in rows),

@@ -118,7 +118,9 @@ def draw(folder: str) -> None:
 
     settings, model = assemble(Config, (run_settings(folder), CONFIG)), load_model(folder)
     background = model.metadata.get("background", WHITE)
-    dataset = load_dataset(settings.data, "val", settings.downscale, holdout=settings.holdout, scene=settings.scene).evenly(1)
+    dataset = load_dataset(
+        settings.data, "val", settings.downscale, holdout=settings.holdout, scene=settings.scene
+    ).evenly(1)
     truth = dataset.composited(0, background)
     image = model.render(dataset.cameras[0], background)["rgb"]
     pictures.write_png(Path(folder) / PICTURE, np.concatenate([truth, np.clip(image, 0, 1)], 1))

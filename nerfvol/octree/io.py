@@ -155,7 +155,9 @@ def _check_document(file: ArrayFile) -> dict[str, Any]:
         if document.get(key) != known:
             raise file.fault(f"its {key} convention is {shown(document.get(key))}, expected {known!r}")
     if document.get("storage") not in get_args(Storage):
-        raise file.fault(f"its storage is {shown(document.get('storage'))}, expected one of {', '.join(get_args(Storage))}")
+        raise file.fault(
+            f"its storage is {shown(document.get('storage'))}, expected one of {', '.join(get_args(Storage))}"
+        )
     if not isinstance(document.get("metadata"), dict):
         raise file.fault("its metadata is not a JSON object")
     box = document.get("aabb")

@@ -1,0 +1,70 @@
+"""Views of a data set scored by the workers of a cluster, as nerfvol.measure.scores does it here."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerfvol.cluster.tasks import Job
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.load import load_dataset
+from nerfvol.film import with_progress
+from nerfvol.measure import scores
+from nerfvol.models import Model, load_model
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+LOADING = ("data", "split", "downscale", "holdout", "scene")
+
+
+def evaluate(
+    client: Client, path: Path, dataset: Dataset, settings: Mapping[str, Any],
+    say: Callable[[str], object], on_view: Callable[[int, Any, Any], None] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """What scores.evaluate returns of the model in ``path``, the views drawn and scored by a client's workers.
+
+    ``settings``: background, early_stop_eps, lod, composite and LOADING, with which ``dataset`` was loaded; the workers must have
+    the same files at the same place. ``say``: gets sentences on workers that take no part.
+    """
+    from nerfvol.cluster.fit import Needs, with_data
+    from nerfvol.cluster.ship import describe
+    from nerfvol.cluster.window import Window
+
+    file, data = describe(path), str(Path(settings["data"]).resolve())
+    job = Job("nerfvol.cluster.views:score", {**settings, "data": data, "image": on_view is not None}, {"model": file})
+    window = Window(client, job, Needs(data=with_data([data]), room=file.size))
+    for message in window.messages:
+        say(message)
+    indices = scores.scored_views(dataset)
+    rows = []
+    for index, (row, image) in zip(indices, with_progress(window.results(indices), len(indices)), strict=True):
+        rows.append(row)
+        if on_view is not None:
+            on_view(index, dataset.composited(index, settings["background"]), image)
+    return scores.summarised(rows)
+
+
+def score(settings: Mapping[str, Any], files: Mapping[str, Path], index: int) -> tuple[dict[str, Any], Any]:
+    """The row of one view, and its render where settings["image"] asks for it. A task (cluster.tasks)."""
+    model, dataset = _opened(json.dumps(dict(settings), sort_keys=True), files["model"])
+    started = time.perf_counter()
+    drawing = settings["background"], ("rgb",), settings["early_stop_eps"], settings["lod"]
+    image = model.render(dataset.cameras[index], *drawing)["rgb"]
+    seconds = time.perf_counter() - started
+    image = np.clip(image, 0.0, 1.0)
+    row = scores.score_view(image, dataset, index, settings["background"], scores.has_colour_maps(model))
+    return row | {"seconds": seconds}, image if settings["image"] else None
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(settings: str, path: Path) -> tuple[Model, Dataset]:
+    """Model and data set, which a worker keeps open."""
+    s = json.loads(settings)
+    return load_model(path), load_dataset(s["data"], s["split"], s["downscale"], holdout=s["holdout"], scene=s["scene"])
