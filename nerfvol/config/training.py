@@ -346,7 +346,7 @@ class SceneChoices:
 
 OCTREE_STARTS = ("direct", "mlp")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "random")
-"""Besides a file of splats."""
+"""Besides a file of splats or of an octree."""
 
 
 @dataclass
@@ -363,7 +363,7 @@ class Config(Checked):
     init: str = "auto"
     """Where it starts. An octree: "mlp", a small field that is trained and distilled, or "direct", low density everywhere
     (auto). Splats: "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "random", or a
-    file of splats (auto: what there is)."""
+    file or run of splats or of an octree (auto: what there is)."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     scene: Literal["auto", "object", "surroundings", "room", "forward"] = "auto"
@@ -415,7 +415,7 @@ class Config(Checked):
         is_file = self.representation != "octree" and Path(self.init).exists()
         if self.init != "auto" and self.init not in names and not is_file:
             of = "" if self.representation == "auto" else f" for {self.representation}"
-            or_file = "" if self.representation == "octree" else " or a file of splats"
+            or_file = "" if self.representation == "octree" else " or a file of splats or an octree"
             raise InputError(f"init: expected auto, {', '.join(names)}{or_file}{of}, got {self.init!r}")
 
     def for_scene(self, scene: SceneBounds) -> Config:

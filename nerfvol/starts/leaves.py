@@ -113,7 +113,8 @@ def _filled(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Pairs of a Gaussian and a cell that it fills: the Gaussian's number, the cell's level and Morton code, (m,) each."""
     side = size / 2.0**levels
-    steps = np.ceil(g.reach[:, None] * g.scales / (SPACING * side[:, None])).astype(np.int64)
+    half = g.reach[:, None] * np.hypot(g.scales, BLUR * side[:, None])  # so that thin discs are closed
+    steps = np.ceil(half / (SPACING * side[:, None])).astype(np.int64)
     shapes, group = np.unique(steps, axis=0, return_inverse=True)
     order = np.argsort(group.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(group.reshape(-1), minlength=len(shapes)))
@@ -125,7 +126,7 @@ def _filled(
         if (shape > 0).any() and not len(lattice):
             lattice = np.zeros((1, 3))
         for part in np.array_split(members, 1 + len(members) * len(lattice) // 500_000):
-            own = lattice * (g.reach[part, None] * g.scales[part])[:, None]
+            own = lattice * half[part, None]
             points = g.means[part, None] + own @ g.axes[part].transpose(0, 2, 1)
             cells = np.floor((points - origin) / side[part, None, None]).astype(np.int64)
             within = ((cells >= 0) & (cells < (1 << levels[part])[:, None, None])).all(2)

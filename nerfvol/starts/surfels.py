@@ -21,15 +21,15 @@ from nerfvol.rotations import turning_z_to
 from nerfvol.splats.points import Y00
 from nerfvol.splats.splats import Splats
 
-WIDTH, THICKNESS = 0.45, 0.12
-"""Standard deviations of a disc in units of its cell's side: two neighbours overlap at half their height."""
+WIDTH, THICKNESS = 0.5, 0.12
+"""Standard deviations of a disc in units of its cell's side: a plane of them is even to 1.5 %."""
 SEEN = 0.05
 """Largest rendering weight from which a leaf is visible."""
-COLOUR, AGREEMENT = 0.06, 0.8
+COLOUR, AGREEMENT = 0.06, 0.95
 """Deviation of colours, and length of the mean unit normal, up to and from which the cells of a larger one are one disc."""
 MOST_OPAQUE = 0.95
 """Opacity of a disc: at more no gradient passes what is behind."""
-LARGEST = 3
+LARGEST = 2
 """Levels above the finest leaf at which discs stop to grow."""
 
 Float = NDArray[np.float64]
@@ -86,11 +86,11 @@ def surfels(
         raise InputError("no ray sees any of the octree's leaves, so there is no surface to put splats on")
     leaves = {int(level): _leaves(octree, seen[octree.leaf_level[seen] == level])
               for level in np.unique(octree.leaf_level[seen])}  # fmt: skip
-    tolerance = COLOUR
-    chosen = _merged(leaves, tolerance)
-    while most is not None and sum(len(cells.mass) for cells in chosen.values()) > most and tolerance < 0.5:
-        tolerance *= 1.5
-        chosen = _merged(leaves, tolerance)
+    chosen = _merged(leaves, COLOUR, AGREEMENT)
+    for loosened in range(1, 6):
+        if most is None or sum(len(cells.mass) for cells in chosen.values()) <= most:
+            break
+        chosen = _merged(leaves, COLOUR * 1.5**loosened, AGREEMENT * 0.8**loosened, LARGEST + loosened // 3)
     splats = _discs(octree, chosen, mode)
     if most is not None and splats.n > most:
         mass = np.concatenate([cells.mass for cells in chosen.values()])
@@ -103,9 +103,9 @@ def _leaves(octree: Octree, chosen: NDArray[np.int64]) -> _Cells:
     codes = morton(octree.leaf_ijk[chosen])
     side = octree.leaf_sizes()[chosen[:1]]
     corners = octree.corners[chosen]
-    sigma = octree.density_scale * explin(octree.density[corners].astype(np.float64))
-    opacity = -np.expm1(-sigma * side)  # whose gradient is that of the surface, however dense it is behind
-    gradient = np.stack([opacity @ (2.0 * OFFSETS[:, k] - 1) for k in range(3)], 1)
+    raw = octree.density[corners].astype(np.float64)  # whose gradient is as steep before a surface as within it
+    gradient = np.stack([raw @ (2.0 * OFFSETS[:, k] - 1) for k in range(3)], 1)
+    sigma = octree.density_scale * explin(raw)
     normal = -gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
     share = sigma + 1e-9
     share /= share.sum(1, keepdims=True)
@@ -118,7 +118,7 @@ def _leaves(octree: Octree, chosen: NDArray[np.int64]) -> _Cells:
     return _Cells(codes, sigma.mean(1) * side**3, position, normal, rows, dc**2)
 
 
-def _merged(leaves: dict[int, _Cells], tolerance: float) -> dict[int, _Cells]:
+def _merged(leaves: dict[int, _Cells], tolerance: float, agreement: float, largest: int = LARGEST) -> dict[int, _Cells]:
     """Discs' cells by level: where a cell's children agree, the cell."""
     finest, done = max(leaves), {}
     none = _Cells(*(column[:0] for column in vars(leaves[finest]).values()))
@@ -130,8 +130,8 @@ def _merged(leaves: dict[int, _Cells], tolerance: float) -> dict[int, _Cells]:
         parents, number = cells.parents()
         dc = parents.rows.reshape(len(parents.code), 3, -1)[:, :, 0] * Y00
         deviation = np.sqrt(np.maximum(parents.square - dc**2, 0).max(1))
-        one = (deviation < tolerance) & (np.linalg.norm(parents.normal, axis=1) > AGREEMENT)
-        one &= level > finest - LARGEST
+        one = (deviation < tolerance) & (np.linalg.norm(parents.normal, axis=1) > agreement)
+        one &= level > finest - largest
         if not one[number].all():
             done[level] = cells[~one[number]]
         cells = parents[one]

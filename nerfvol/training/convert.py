@@ -55,8 +55,6 @@ FIT = {
     "decay_from": 0.2, "growing_error": 0.0, "tv_from": 0, "prune_weight": 0.005,
 }  # fmt: skip
 """Settings of the fit: one stage, and rates that fall from a fifth of it on."""
-TUNE = {"colour_weight": 0.02, "rate_density": 0.15, "rate_dc": 0.05, "decay_from": 0.3}
-"""... and of training on photographs afterwards."""
 
 Say = Callable[[str], object]
 
@@ -133,7 +131,7 @@ def tuned_octree(
     octree: Octree, dataset: Dataset, background: Sequence[float], config: Config, say: Say = print
 ) -> Octree:
     """An octree trained further on photographs, for ``config.time_budget`` seconds or FINE_STEPS steps."""
-    settings = dataclasses.replace(config.octree, steps=FINE_STEPS, **TUNE)
+    settings = dataclasses.replace(config.octree, steps=FINE_STEPS)
     trainer = OctreeTrainer(dataset, background, settings, config.seed, octree)
     _run(trainer, config.time_budget, FINE_STEPS, say)
     return trainer.finish()

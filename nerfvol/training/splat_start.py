@@ -15,6 +15,8 @@ from nerfvol.splats.splats import Splats
 from nerfvol.starts.choose import STARTS, choose_start
 from nerfvol.starts.cloud import splats_of_cloud
 from nerfvol.starts.subject import subject_of
+from nerfvol.starts.surfels import surfels
+from nerfvol.starts.visible import JUDGING_VIEWS, judged_downscale, largest_weights
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule, saved_schedule
 
@@ -55,7 +57,7 @@ def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats,
         with _saved_of(run) as saved:
             return SplatState.from_arrays(saved).splats(), float(saved["subject_distance"])
     if config.init not in ("auto", *STARTS):
-        return _from_file(run, config.init, degree), subject_of(dataset).distance
+        return _from_file(run, config.init, degree, most), subject_of(dataset).distance
     start = choose_start(dataset, photographs, None if config.init == "auto" else config.init, config.seed)
     run.say(start.sentence)
     opacity = OBJECT_OPACITY if start.name == "random" else 0.5
@@ -66,16 +68,22 @@ def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats,
     return splats_of_cloud(cloud, photographs.cameras, distance, degree, config.splats.mode, opacity), distance
 
 
-def _from_file(run: Run, path: str, degree: int) -> Splats:
-    """The splats of a file or run folder."""
+def _from_file(run: Run, path: str, degree: int, most: int) -> Splats:
+    """The splats of a file or run folder; of an octree discs on what the training views see of it, at most ``most``."""
     from nerfvol.models import load_model
-    from nerfvol.views import SplatModel
+    from nerfvol.views import OctreeModel, SplatModel
 
-    model = load_model(path)
+    model, config = load_model(path), run.config
+    if isinstance(model, OctreeModel):
+        seen = run.data.training.evenly(JUDGING_VIEWS)
+        weights = largest_weights(model.octree, seen, config.background, judged_downscale(seen))
+        splats = surfels(model.octree, weights, most, config.splats.mode)
+        run.say(f"start: {splats.n:,} discs on what is seen of the {model.octree.n_leaves:,} leaves of {path}")
+        return splats.with_sh_degree(degree)
     if not isinstance(model, SplatModel):
-        raise InputError(f"--init {path}: expected splats, it is a model of {model.kind}")
-    n, most = model.packed.n, run.config.splats.max_splats
-    if not n or (most is not None and n > most):
-        raise InputError(f"--init {path}: it has {n:,} splats, expected 1 to {most or 'any number':,}")
+        raise InputError(f"--init {path}: expected splats or an octree, it is a model of {model.kind}")
+    n, limit = model.packed.n, config.splats.max_splats
+    if not n or (limit is not None and n > limit):
+        raise InputError(f"--init {path}: it has {n:,} splats, expected 1 to {limit or 'any number':,}")
     run.say(f"start: the {n:,} splats of {path}")
     return run.data.frame.splats_into(model.splats.with_sh_degree(degree))

@@ -357,13 +357,11 @@ def test_a_run_goes_on_without_the_file_it_began_with(tmp_path, whole):
 
 
 @pytest.mark.parametrize("representation, init, reason", [
-    ("splats", "fog", "expected auto, points, sweep, points.sweep, random or a file of splats for splats, got 'fog'"),
-    ("splats", "mlp", "expected auto, points.* or a file of splats for splats, got 'mlp'"),
+    ("splats", "fog", "expected auto, points, .*random or a file of splats or an octree for splats, got 'fog'"),
+    ("splats", "mlp", "expected auto, points.* or a file of splats or an octree for splats, got 'mlp'"),
     ("octree", "sweep", "expected auto, direct, mlp for octree, got 'sweep'"),
     ("octree", "FILE", "expected auto, direct, mlp for octree, got '.*octree.safetensors'"),
-    ("auto", "fog", "expected auto, direct, mlp, points.* or a file of splats, got 'fog'"),
-    ("splats", "FILE", "expected splats, it is a model of octree"),
-    ("auto", "FILE", "expected splats, it is a model of octree"),
+    ("auto", "fog", "expected auto, direct, mlp, points.* or a file of splats or an octree, got 'fog'"),
     ("splats", "points", "the start 'points' cannot be used: .* without the points of a model"),
     ("mesh", "auto", "representation.*octree.*splats"),
 ])  # fmt: skip

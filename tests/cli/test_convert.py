@@ -1,0 +1,73 @@
+"""``nerfvol convert``: files that open, the cost in a sentence, and refusals."""
+
+import json
+
+import pytest
+
+from nerfvol.models import load_model
+from nerfvol.octree.io import save_octree
+from nerfvol.training import convert
+from nerfvol.training.splat_trainer import SplatTrainer
+from tests.fixtures.runs import TINY
+
+
+@pytest.fixture
+def octree_file(tmp_path, sphere_octree):
+    path = tmp_path / "sphere.safetensors"
+    save_octree(path, sphere_octree, {"background": [1.0, 1.0, 1.0]})
+    return path
+
+
+def test_there_and_back_with_and_without_images(tmp_path, tiny_scene, command, octree_file, monkeypatch):
+    monkeypatch.setattr(convert, "FITTED_STEPS", 5)
+    monkeypatch.setattr(convert, "FITTED_PIXELS", 40)
+    monkeypatch.setattr(convert, "VIRTUAL_VIEWS", 9)
+    splats, again = tmp_path / "s.ply", tmp_path / "o.safetensors"
+    code, out, err = command("convert", octree_file, "--to", "splats", "--data", tiny_scene, "--out", splats)
+    assert code == 0, err
+    assert (
+        "2 held-out views: octree" in out
+        and "dB lost" in out
+        and f"{load_model(splats).describe()['splats']:,} splats" in out
+    )
+    code, out, err = command("convert", splats, "--to", "octree", "--level", 5, "--out", again)
+    assert code == 0, err
+    assert f"pictures of {splats}" in out and load_model(again).kind == "octree"
+    assert command("info", again)[0] == 0
+    tuned = tmp_path / "t.safetensors"
+    code, out, err = command(
+        "convert", octree_file, "--to", "splats", "--data", tiny_scene, "--time-budget", "0.3s", "--out", tuned
+    )
+    assert code == 0 and "steps on the photographs" in out and load_model(tuned).metadata["near"] > 0, err
+    code, out, err = command(
+        "convert", splats, "--to", "octree", "--level", 5, "--data", tiny_scene, "--time-budget", "0.3s", "--out", again
+    )
+    assert code == 0 and "steps on the photographs" in out, err
+
+
+@pytest.mark.parametrize("arguments, reason", [
+    (["--out", "x.safetensors"], "needs --to"),
+    (["--to", "splats"], "needs --out"),
+    (["--to", "octree", "--out", "x.safetensors"], "holds octree already"),
+    (["--to", "splats", "--out", "x.obj"], "x.obj: expected a file that ends in .safetensors, .ply or .spz"),
+    (["--to", "mesh", "--out", "x.safetensors"], "to: expected"),
+    (["--to", "splats", "--out", "x.safetensors", "--data", "nowhere"], "--data nowhere: no such folder"),
+    (["--to", "splats", "--out", "x.safetensors", "--time-budget", "3s"], "say which with --data"),
+])  # fmt: skip
+def test_what_cannot_be_is_one_sentence(command, octree_file, monkeypatch, tmp_path, arguments, reason):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = command("convert", octree_file, *arguments)
+    assert code == 2 and err.startswith("nerfvol: error: ") and err.count("\n") == 1 and reason in err, err
+
+
+def test_splats_are_trained_from_an_octree(tmp_path, tiny_scene, command, octree_file, monkeypatch):
+    begun = []
+    monkeypatch.setattr(SplatTrainer, "__init__", lambda self, photographs, splats, *rest, init=SplatTrainer.__init__: (
+        begun.append(splats), init(self, photographs, splats, *rest))[1])  # fmt: skip
+    (tmp_path / "tiny.yaml").write_text(json.dumps({**TINY, "splats": {"steps": 3, "max_splats": 500}}))
+    code, out, err = command(
+        "train", "--data", tiny_scene, "--representation", "splats", "--init", octree_file, "--out", tmp_path / "run",
+        "--config", tmp_path / "tiny.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "discs on what is seen of the" in out and 0 < begun[0].n <= 500

@@ -1,0 +1,106 @@
+"""Converting there and back: a sphere of discs becomes an octree of the same radius, whose surfels show it again."""
+
+import numpy as np
+import pytest
+
+from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.kernels import ops
+from nerfvol.measure.metrics import psnr
+from nerfvol.region import SceneBounds
+from nerfvol.splats.points import dc_of_colour
+from nerfvol.splats.splats import Splats, turning_z_to
+from nerfvol.training import convert
+from nerfvol.training.convert import cameras_around, octree_of, seen_by, splats_of
+from nerfvol.views import OctreeModel, SplatModel
+from tests.fixtures.tiny import TINY_RADIUS, sphere_colour
+
+WHITE = (1.0, 1.0, 1.0)
+SCENE = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, False)
+LEVEL = 5
+SIDE = 2 / 2**LEVEL
+
+
+def sphere_of_discs(n: int = 1200) -> SplatModel:
+    """Discs evenly on the sphere of TINY_RADIUS, so wide that it is closed."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, k * np.pi * (1 + np.sqrt(5))
+    normals = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], 1)
+    apart = TINY_RADIUS * np.sqrt(4 * np.pi / n)
+    scales = np.tile([0.6 * apart, 0.6 * apart, 0.1 * apart], (n, 1))
+    colours = sphere_colour(TINY_RADIUS * normals)
+    return SplatModel(
+        Splats(TINY_RADIUS * normals, np.log(scales), turning_z_to(normals), np.full(n, 3.0), dc_of_colour(colours))
+    )
+
+
+def cameras(n: int, elevation: float):
+    lens = Intrinsics(64, 64, 90, 90, 32, 32)
+    return orbit(n, center=(0, 0, 0), radius=3.2, elevation_deg=elevation, intrinsics=lens)
+
+
+@pytest.fixture(scope="module")
+def converted():
+    """The discs, pictures of them and their octree."""
+    discs = sphere_of_discs()
+    seen = seen_by(discs, cameras(8, -30) + cameras(8, 30), SCENE, WHITE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(convert, "FITTED_STEPS", 80)
+        octrees = []
+        for threads in (1, 2):
+            before = ops.get_threads()
+            ops.set_threads(threads)
+            octrees.append(octree_of(discs.splats, seen, WHITE, LEVEL))
+            ops.set_threads(before)
+    return discs, seen, octrees
+
+
+def test_the_octree_stands_where_the_splats_do(converted):
+    """From cameras that it was not fitted to: closed, and half of the light is gone within a leaf's diagonal of the sphere."""
+    discs, _, (octree, _) = converted
+    for camera in cameras(3, 5):
+        image = OctreeModel(octree).render(camera, WHITE, ("rgb", "opacity", "median_depth"), 0.0, 0.0)
+        origin, directions = camera.rays_at(np.stack(np.meshgrid(*[np.arange(64) + 0.5] * 2), -1).reshape(-1, 2))
+        b = directions @ origin
+        miss = np.sqrt(np.maximum(origin @ origin - b * b, 0)).reshape(64, 64)
+        distance = (-b - np.sqrt(np.maximum(b * b - origin @ origin + TINY_RADIUS**2, 0))).reshape(64, 64)
+        facing = miss < 0.7 * TINY_RADIUS
+        assert image["opacity"][facing].min() > 0.5 and image["opacity"][facing].mean() > 0.98
+        assert image["opacity"][miss > TINY_RADIUS + 3 * SIDE].max(initial=0) < 0.05
+        assert np.abs(image["median_depth"] - distance)[facing].max() < np.sqrt(3) * SIDE
+        assert psnr(image["rgb"], discs.render(camera, WHITE)["rgb"]) > 25
+
+
+def test_no_leaf_is_empty_space_and_no_visible_disc_is_without(converted):
+    discs, _, (octree, _) = converted
+    splats = discs.splats
+    assert (octree.query(splats.means + splats.origin) >= 0).mean() > 0.98  # those at the poles may be in no picture
+    beyond = np.abs(np.linalg.norm(octree.leaf_centers(), axis=1) - TINY_RADIUS)
+    assert beyond.max() < 2 * np.exp(splats.log_scales[:, 2].max()) + np.sqrt(3) * 2 * SIDE
+
+
+def test_the_same_octree_for_any_number_of_threads(converted):
+    a, b = converted[2]
+    np.testing.assert_array_equal(a.values, b.values)
+    np.testing.assert_array_equal(a.leaf_ijk, b.leaf_ijk)
+
+
+def test_and_back(converted):
+    """Surfels of the octree show the sphere again, on its place."""
+    _, seen, (octree, _) = converted
+    model = SplatModel(splats_of(octree, seen, WHITE))
+    radius = np.linalg.norm(model.splats.means + model.splats.origin, axis=1)
+    assert np.abs(radius - TINY_RADIUS).max() < 3 * SIDE
+    camera = cameras(3, 5)[1]
+    assert psnr(model.render(camera, WHITE)["rgb"], OctreeModel(octree).render(camera, WHITE)["rgb"]) > 23
+
+
+def test_cameras_all_around_see_all_of_it():
+    discs = sphere_of_discs(200)
+    around = cameras_around(discs)
+    corners = np.stack(np.meshgrid(*np.stack(discs.aabb()).T, indexing="ij"), -1).reshape(-1, 3)
+    for camera in around:
+        pixels = camera.project(corners)
+        assert ((pixels >= 0) & (pixels <= (camera.intrinsics.width, camera.intrinsics.height))).all()
+    directions = np.stack([c.position for c in around]) - discs.aabb().mean(0)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert np.abs(directions.mean(0)).max() < 0.02
