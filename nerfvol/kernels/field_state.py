@@ -242,7 +242,9 @@ class March:
         assert compiled is not None
         edges, step = step_edges(domain, self.n_steps)
         group = GROUP
-        if where.cubes == 1:  # half a group must not be longer than a coarse cell; with more cubes, a larger one's serve
+        if (
+            where.cubes == 1
+        ):  # half a group must not be longer than a coarse cell; with more cubes, a larger one's serve
             while group > 1 and group * step / 2 > COARSE * where.cell_edges[0]:
                 group //= 2
         coarse = where.coarse if self.coarse else np.full_like(where.coarse, ~np.uint64(0))
