@@ -128,7 +128,7 @@ class FieldConfig(Checked):
     """Inverse-CDF samples of a ray with the importance sampler."""
     grid_resolution: Annotated[int, within(8, 512)] = 128
     """Cells along an edge of the occupancy grid, a multiple of 4."""
-    rate: Annotated[float, above(0, 1e3)] = 0.01
+    rate: Annotated[float, above(0, 1e3)] = 0.02
     """Adam's learning rate at the start."""
     rate_decay: Decay = 0.05
     """The rate shrinks exponentially to this factor at the end, from a third of the run on."""

@@ -67,8 +67,8 @@ class HashGrid(nn.Module):
     """Multiresolution grid of trilinearly interpolated features (Mueller et al. 2022).
 
     Level l has resolution N_l = floor(n_min * b**l), b = exp(ln(n_max / n_min) / (n_levels - 1)), and its vertices are
-    stored densely where (N_l + 1)**3 fits into 2**log2_table entries; finer levels share the entries through a hash of bricks of
-    2 x 2 x 4 vertices (``layout.GridLevels``).
+    stored densely where (N_l + 1)**3 fits into 2**log2_table entries; finer levels share the entries through a hash of bricks
+    of 2 x 2 x 4 vertices (``layout.GridLevels``).
 
     Args:
         n_levels: number of levels (at least 1).

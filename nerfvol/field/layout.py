@@ -1,7 +1,7 @@
 """What a field's arrays mean: its region, the levels of its hash grid, its layers, its steps. Numbers only, no torch.
 
-The compiled field (``nerfvol.kernels.field_state``) and the one in torch (``nerfvol.field.fields``) share all of it, so that the
-arrays of one are those of the other.
+The compiled field (``nerfvol.kernels.field_state``) and the one in torch (``nerfvol.field.fields``) share all of it, so that
+the arrays of one are those of the other.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def render_rays(
     early_stop_eps: float = 1e-3,
     outputs: Sequence[str] = OUTPUTS,
 ) -> dict[str, Float]:
-    """Draws rays (n, 3), directions unit: rgb (n, 3) over ``background``, not clipped, opacity (n,), depth (n,) expected distance.
+    """Draws rays (n, 3), directions unit: rgb (n, 3) over ``background``, not clipped, opacity (n,), expected depth (n,), u.
 
     Raises ValueError where an argument is not what it should be.
     """

@@ -9,8 +9,8 @@ tau_i = sigma_i delta_i, T_i = exp(-sum_{j<i} tau_j), w_i = T_i (1 - exp(-tau_i)
     loss = mean |C - target|^2 + colour mean (sum w_i |c_i - target|^2 + T |background - target|^2)
          + distortion mean_rays (sum_ij w_i w_j |m_i - m_j| + sum w_i^2 delta_i / 3) + entropy mean_rays H(T)
 
-means over rays and channels where nothing else is said; m and delta in edges of the inner cube; H(T) = -T log T - (1 - T) log(1 - T),
-T limited to [1e-4, 1 - 1e-4]. The network, its encodings and its head are ``nerfvol.field.fields``.
+means over rays and channels where nothing else is said; m and delta in edges of the inner cube;
+H(T) = -T log T - (1 - T) log(1 - T), T limited to [1e-4, 1 - 1e-4]. The network, its encodings and its head are ``nerfvol.field.fields``.
 """
 
 from __future__ import annotations
@@ -149,7 +149,9 @@ def loss_gradient(
     return table, torch.cat(parts), total.detach()
 
 
-def adam(values: Float, first: Float, second: Float, gradient: np.ndarray, rates: FieldRates, decay: float, n: int):
+def adam(
+    values: Float, first: Float, second: Float, gradient: np.ndarray, rates: FieldRates, decay: float, n: int
+) -> None:
     """Adam's n-th update of numbers that have a gradient, in place, the decay inside the gradient [L2, not AdamW]."""
     touched = gradient != 0
     g = gradient[touched] + decay * values[touched].astype(np.float64)

@@ -37,7 +37,8 @@ PROBE_EVERY, PROBES = 32, 32768
 SLOW_LEVELS, SLOW_EVERY = 3, 2
 """Levels of the grid from this one on are moved at every second step, by the gradient of both: half the work of Adam."""
 NETWORK_DECAY = 1e-6
-EPS = 1e-15
+EPS = 1e-6
+"""Of Adam: entries that only samples of no weight were in hardly move, which 1e-15 would send a full step at random."""
 WARM_UP = 20
 """Steps over which the rate rises."""
 

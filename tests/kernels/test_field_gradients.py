@@ -94,7 +94,9 @@ def test_values_at_points(isa, name):
     # sigma is an exponential: the error of the raw density, of the order of the largest, is relative to it.
     largest = max(1.0, float(sigma.log().abs().max())) if state.shape.density == "exp" else 1.0
     scale = sigma.numpy() if state.shape.density == "exp" else float(sigma.max())
-    assert np.abs(ours_sigma - sigma.numpy()).max(initial=0, where=sigma.numpy() > 0) <= np.max(tolerance * largest * scale)
+    assert np.abs(ours_sigma - sigma.numpy()).max(initial=0, where=sigma.numpy() > 0) <= np.max(
+        tolerance * largest * scale
+    )
     assert np.abs(ours - values.numpy()).max() <= tolerance * max(1.0, float(values.abs().max()))
     assert np.array_equal(field_ops.evaluate(state, x, values=False)[0], ours_sigma)
 

@@ -28,9 +28,7 @@ def trained(n_rays: int = 700, steps: int = 4, resume_at: int | None = None) -> 
             state = FieldState(state.domain, state.shape, seed=9)
             state.load_arrays(saved)
         moves = [level < 3 or k % 2 == 1 for level in range(state.n_levels)]
-        reports.append(
-            field_ops.train_step(state, fields.rays(n_rays, seed=k), march, fields.ALL_TERMS, RATES, moves)
-        )
+        reports.append(field_ops.train_step(state, fields.rays(n_rays, seed=k), march, fields.ALL_TERMS, RATES, moves))
     return state, reports
 
 
