@@ -3,8 +3,8 @@
     python tools/clients.py FOLDER [--render PICTURE.png]
 
 FOLDER holds files that ``nerfvol export`` wrote (.vdb .glb .ply .obj .htg .vti); each is opened by whichever of the two can.
-Neither is a dependency: bpy has 370 MB, vtk 140 MB; ``make clients EXPORTS=FOLDER`` installs them. ``--render`` draws the .vdb, or
-else the .glb, in Blender's Cycles.
+Neither is a dependency: bpy has 370 MB, vtk 140 MB; ``make clients EXPORTS=FOLDER`` installs them. ``--render`` draws the .vdb,
+or else the .glb, in Blender's Cycles.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def load_volume(bpy: Any, path: Path) -> Any:
 
 
 def volume_material(bpy: Any) -> Any:
-    """Six nodes that are our emission-absorption integral: black absorption of ``density``, emission of ``color`` x ``density``."""
+    """Six nodes of our emission-absorption integral: black absorption of ``density``, emission of ``color`` x ``density``."""
     material = bpy.data.materials.new("nerfvol")
     material.use_nodes = True
     tree = material.node_tree
