@@ -44,6 +44,7 @@ class Drawing {
       worker.onmessage = ({ data }) => {
         if (data.type === "opened") return resolve();
         if (data.type !== "part") return this.hear(worker, data);
+        performance.mark(data.name);
         relay(index, data);
         if (data.name === "nodes") this.active = [...this.workers];
       };

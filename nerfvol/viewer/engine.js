@@ -39,18 +39,6 @@ function readArrays(bytes) {
   return { document, read, fault };
 }
 
-async function inflate(bytes, count, fault) {
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  let out;
-  try {
-    out = new Uint8Array(await new Response(stream).arrayBuffer());
-  } catch {
-    throw fault("its numbers are damaged");
-  }
-  if (count !== null && out.length !== count) throw fault("it does not hold as many numbers as it declares");
-  return out;
-}
-
 class Engine {
   // parts: which of "corners", "values" and "nodes" of an octree are made here; others come by `take`.
   static async open(module, bytes, parts = ["corners", "values", "nodes"]) {
@@ -65,7 +53,7 @@ class Engine {
     const opener = openers[file.document.format];
     if (!opener || file.document.storage !== "compact") throw file.fault("it is of a kind that this page cannot draw");
     try {
-      await engine[opener](file, parts);
+      engine[opener](file, parts);
     } catch (error) {
       if (error instanceof ModelError) throw error;
       if (error instanceof TypeError) throw file.fault("its header is damaged");
@@ -83,22 +71,22 @@ class Engine {
     return at;
   }
 
-  // Calls `use(index, low, high)` with the two planes of each of `n` channels, inflated, one after the other.
-  async channels(n, count, file, use) {
-    const name = (index, plane) => `code${String(index).padStart(3, "0")}.${plane}`;
-    const load = (index) => Promise.all(["low", "high"].map((p) => inflate(file.read(name(index, p)), count, file.fault)));
-    let next = load(0);
+  // Calls `use(index, low, high)` with the two planes of each of `n` channels, `count` bytes each, one after the other.
+  channels(n, count, file, use) {
+    const planes = ["low", "high"].map(() => this.wasm.reserve(Math.max(count, 1)) >>> 0);
     for (let index = 0; index < n; ++index) {
-      const planes = await next;
-      if (index + 1 < n) (next = load(index + 1)).catch(() => 0);
-      const [low, high] = planes.map((plane) => this.keep(plane));
-      use(index, low, high);
-      this.wasm.release(low);
-      this.wasm.release(high);
+      ["low", "high"].forEach((plane, i) => {
+        const packed = file.read(`code${String(index).padStart(3, "0")}.${plane}`), at = this.keep(packed);
+        const good = this.wasm.inflate(at, packed.length, planes[i], count);
+        this.wasm.release(at);
+        if (!good) throw file.fault("its numbers are damaged");
+      });
+      use(index, ...planes);
     }
+    planes.forEach((plane) => this.wasm.release(plane));
   }
 
-  async openOctree(file, parts) {
+  openOctree(file, parts) {
     const d = file.document, codec = d.codec;
     const nodes = file.read("node_mask"), leaves = file.read("leaf_mask");
     if (nodes.length !== leaves.length || !codec) throw file.fault("its parts do not fit together");
@@ -112,7 +100,7 @@ class Engine {
       this.lacks.delete("corners");
     }
     if (!parts.includes("values")) return;
-    await this.channels(1 + 3 * (d.sh_degree + 1) ** 2, d.n_vertices, file, (index, low, high) =>
+    this.channels(1 + 3 * (d.sh_degree + 1) ** 2, d.n_vertices, file, (index, low, high) =>
       this.wasm.octree_channel(index, low, high, codec.differences[index], index ? codec.sh_step : codec.density_step,
         codec.density_softness));
     this.lacks.delete("values");
@@ -147,7 +135,7 @@ class Engine {
     if (name === "nodes") this.wasm.octree_finish();
   }
 
-  async openSplats(file) {
+  openSplats(file) {
     const d = file.document, c = d.codec, basis = (d.sh_degree + 1) ** 2;
     if (!c) throw file.fault("its parts do not fit together");
     this.wasm.splats_open(d.n, basis, d.mode === "mip" ? 1 : 0, ...d.origin, d.metadata.near);
@@ -159,7 +147,7 @@ class Engine {
       if (i === 12) return [10, c.logit_step];
       return [i - 2, (i - 13) % basis ? c.sh_step : c.dc_step];
     };
-    await this.channels(13 + 3 * basis, d.n, file, (index, low, high) => {
+    this.channels(13 + 3 * basis, d.n, file, (index, low, high) => {
       const [row, factor] = target(index);
       this.wasm.splats_channel(row, low, high, c.differences[index], factor);
     });

@@ -19,8 +19,13 @@ async function decode(text) {
 // The model is the last thing in the file; the interface is there before it.
 const loaded = new Promise((done) => (document.readyState === "loading" ? document.addEventListener("DOMContentLoaded", done) : done()));
 
+function inflate(bytes) {
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+}
+
 async function modelBytes() {
   await loaded;
+  performance.mark("loaded");
   const element = $("model");
   if (!element) throw new ModelError("The model in this page is missing: the file is cut off.");
   const text = element.textContent;
@@ -40,9 +45,10 @@ function fault(sentence) {
 async function open() {
   if (typeof WebAssembly !== "object" || typeof DecompressionStream !== "function" || typeof OffscreenCanvas !== "function")
     throw new ModelError("This browser is too old for this page: it needs one of 2023 or later.");
-  const kernels = await inflate(await decode($("kernels").textContent.trim()), null, (why) => new ModelError(`The page is damaged: ${why}.`));
+  const kernels = await inflate(await decode($("kernels").textContent.trim()));
   const [module, bytes] = await Promise.all([WebAssembly.compile(kernels), remote ? remote.model() : modelBytes()]);
   model = bytes;
+  performance.mark("decoded");
   const { document: described } = readArrays(bytes);  // says at once what is cut off
   const memory = navigator.deviceMemory || 8, many = bytes.length > 2e7 && memory < 8 ? 2 : 4;
   const count = clamp(Math.min(navigator.hardwareConcurrency || 2, many), 1, 4);
@@ -50,6 +56,7 @@ async function open() {
   drawing.range = settings.depths;
   drawing.onpicture = shown;
   await drawing.open($("worker").textContent, module, bytes, count);
+  performance.mark("opened");
   changed();
   if (!remote) return;
   const distance = (m) => Math.max(norm(sub([m[0][3], m[1][3], m[2][3]], first.pivot)), 1e-6);

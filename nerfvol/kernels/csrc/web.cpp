@@ -184,6 +184,8 @@ float* data(std::vector<float>& v) { return v.empty() ? nullptr : v.data(); }
 NERFVOL_WEB(reserve) void* web_reserve(uint32_t bytes) { return ::operator new[](bytes, std::align_val_t{64}); }
 NERFVOL_WEB(release) void web_release(void* p) { ::operator delete[](p, std::align_val_t{64}); }
 
+NERFVOL_WEB(inflate) int web_inflate(const uint8_t* from, int32_t n_from, uint8_t* to, int32_t n) { return nerfvol::inflate(from, n_from, to, n); }
+
 // ------------------------------------------------------------------ opening an octree
 NERFVOL_WEB(octree_open)
 int octree_open(const uint8_t* node_mask, const uint8_t* leaf_mask, int32_t n_nodes, int32_t n_vertices, int degree, float x,

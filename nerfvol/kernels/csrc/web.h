@@ -20,6 +20,9 @@ struct WebPicture {
     std::vector<float> rgb, trans, depth, median, normal;
 };
 
+// The zlib stream `from` as exactly n bytes; false where it is damaged or holds more or fewer.
+bool inflate(const uint8_t* from, int64_t n_from, uint8_t* to, int64_t n);
+
 // Numbers that a channel's two byte planes hold (nerfvol/octree/codec.py).
 void unpack_codes(const uint8_t* low, const uint8_t* high, int64_t n, bool differences, int32_t* codes);
 
