@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from data_synth import lights as lamps
 from data_synth import materials as stuff
-from data_synth import media, surfaces, volumes
+from data_synth import media, surfaces, truth, volumes
 from data_synth.cameras import Camera, Viewpoints
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
@@ -64,24 +64,25 @@ class Scene:
         if not rows and not glows:
             warnings.warn(f"scene {self.name} has no lights: the picture is black", RenderWarning, stacklevel=3)
         shapes = surfaces.geometry(self.shapes, self.triangles)
-        used = {int(k) for k in [*shapes.shapes[:, 1], *shapes.triangles[:, 0]]}
-        if used and max(used) >= len(self.materials):
-            raise InputError(f"scene {self.name}: material {max(used)} is used, {len(self.materials)} are defined")
         own = _table(self.lights, lamps.WIDTH)
         return World(
             self.medium if self.medium is not None else NOTHING,
             pool(self.media),
             shapes,
-            stuff.Materials(self._boundaries(used), _table(self.layers, 10)),
+            stuff.Materials(self.boundaries(), _table(self.layers, 10)),
             _table(rows, lamps.WIDTH),
             own[own[:, 0] == lamps.QUAD],
             own[own[:, 0] == lamps.SKY],
             stuff.CLEAR if self.bounded or self.medium is None else 0,
         )
 
-    def _boundaries(self, used: set[int]) -> np.ndarray:
+    def boundaries(self) -> np.ndarray:
         """The material table, with the media and counters of those boundaries that are used."""
-        rows = _table(self.materials, 16)
+        numbers = [int(row[1]) for row in self.shapes]
+        numbers += [] if self.triangles is None else [int(k) for k in np.unique(self.triangles[:, 0])]
+        used, rows = set(numbers), _table(self.materials, 16)
+        if used and max(used) >= len(rows):
+            raise InputError(f"scene {self.name}: material {max(used)} is used, {len(rows)} are defined")
         counters = 0
         for k in sorted(used):
             kind, medium = rows[k, 0], rows[k, 13]
@@ -119,7 +120,8 @@ class Scene:
         return (integrator or make(self.integrators[0])).render(self, camera, seed=seed)
 
     def write_truth(self, out_dir: Path) -> None:
-        """density.npz and density.vdb: the true extinction of a grid medium."""
+        """truth.npz, all that the scene is made of; of a grid medium also density.npz and density.vdb, its extinction."""
+        truth.write(self, out_dir / "truth.npz")
         if self.medium is not None and self.medium.kind == media.GRID:
             volumes.write_density(self.medium, out_dir)
 

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from data_synth import clouds, lights, materials, media, phase, surfaces
+from data_synth import blackbody, clouds, lights, materials, media, phase, surfaces
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError, RenderWarning
 from data_synth.jit import in_bands
@@ -108,14 +108,15 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
     )
 
 
-def explosion(density: float = 16.0, heat: float = 16.0, resolution: int = 128, seed: int = 4) -> Scene:
-    """a fireball: soot that glows as a black body where it is hot"""
+def explosion(
+    density: float = 16.0, heat: float = 8.0, kelvin: float = 2600.0, resolution: int = 128, seed: int = 4
+) -> Scene:  # fmt: skip
+    """a fireball: soot that glows as a black body, hottest in its cracks"""
     n = resolution
     rho, hot = np.empty((n, n, n), np.float32), np.empty((n, n, n), np.float32)
     t = cloud_textures(seed, 64).base
     in_bands(lambda a, b: fill_fireball(t, rho, hot, a, b), n, 4)
-    kelvin = np.linspace(0.0, 1.0, 32)
-    glow = np.stack([kelvin**2.2, 0.48 * kelvin**3.6, 0.16 * kelvin**6.5], axis=1) * heat
+    glow = heat * blackbody.glow(kelvin * np.linspace(0.6, 1.0, 64), kelvin)
     medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.35, glow, attribute=hot)
     return Scene(
         medium=medium,

@@ -121,7 +121,8 @@ def test_sheets_let_light_through_to_what_lies_below():
     floor, c = surfaces.plane(0, (0, 0, 0), (0, 0, 1)), camera((0.1, -1.0, 0.3), (0, 0, 0))
     albedo = np.array([0.8, 0.5, 0.2])
     for lamp, irradiance in (
-        (lights.directional((0, 0, 1), 2.0), 2.0 * np.exp(-0.5)), (lights.environment(0.7), 0.7 * np.pi * 2 * special.expn(3, 0.5)),
+        (lights.directional((0, 0, 1), 2.0), 2.0 * np.exp(-0.5)),
+        (lights.environment(0.7), 0.7 * np.pi * 2 * special.expn(3, 0.5)),
     ):  # fmt: skip
         scene = Scene(shapes=[floor], lights=[lamp], **sheet(0.5))
         want = albedo / np.pi * irradiance

@@ -119,7 +119,7 @@ def test_lamps_throw_shadows():
         return Scene(
             medium=media.grid(np.ones((9, 9, 9)), (-1, -1, -0.9), (1, 1, 0.9), (0.3, 0.5, 0.8), (0.9, 0.6, 0.3)),
             shapes=[surfaces.plane(0, (0, 0, -1), (0, 0, 1))], materials=[materials.lambert(0.5)],
-            lights=[lights.directional((0, 0, 1), 2.0), lights.quad((-20, -20, 1.5), (0, 40.0, 0), (40.0, 0, 0), 0.0, back=back)],
+            lights=[lights.directional((0, 0, 1), 2.0), lights.quad((-20, -20, 1.5), (0, 40, 0), (40, 0, 0), 0.0, back)],
         )  # fmt: skip
 
     c = camera((0.1, -3.0, 0.2), (0, -1.0, -1.0))

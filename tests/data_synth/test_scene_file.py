@@ -15,14 +15,16 @@ medium: {grid: {density: [[[0, 1], [1, 0]], [[2, 1], [0, 1]]], lo: [-1, -1, -1],
   Le: 0.1, phase: {two_lobes: {g1: 0.6, g2: -0.2, mix: 0.7}}}}
 media:
   fog: {homogeneous: {lo: [-2, -2, -2], hi: [2, 2, 2], sigma_t: 0.3, phase: rayleigh}}
-  haze: {exponential: {lo: [0, 0, 0], hi: [1, 1, 1], height: 0.3, phase: {microflakes: {S: {fibre: {axis: [1, 0, 0], roughness: 0.2}}}}}}
+  haze: {exponential: {lo: [0, 0, 0], hi: [1, 1, 1], height: 0.3,
+    phase: {microflakes: {S: {fibre: {axis: [1, 0, 0], roughness: 0.2}}}}}}
   puff: {volume: {file: v.npz, size: 3, centre: [0, 0, 1], sigma_t: 4, phase: isotropic}}
 materials:
   floor: {lambert: {albedo: 0.6, second: 0.2, square: 0.25}}
   shine: {blinn_phong: {albedo: [0.5, 0.1, 0.1], gloss: 0.2, exponent: 40}}
   glass: {dielectric: {ior: 1.5, medium: fog, priority: 2}}
   edge: {"null": {medium: none}}
-  leaf: {layered: {layers: [{tau: 0.1, S: {surface: {normal: [0, 0, 1], roughness: 0.3}}, albedo: 0.9}, {tau: 1, S: [1, 1, 1, 0, 0, 0], albedo: 0.2}]}}
+  leaf: {layered: {layers: [{tau: 0.1, S: {surface: {normal: [0, 0, 1], roughness: 0.3}}, albedo: 0.9},
+    {tau: 1, S: [1, 1, 1, 0, 0, 0], albedo: 0.2}]}}
 shapes:
   - plane: {material: floor, point: [0, 0, -1], normal: [0, 0, 2]}
   - sphere: {material: glass, centre: [0, 0, 0], radius: 0.5}
@@ -97,7 +99,8 @@ def test_the_example_is_a_scene():
     ("medium: {grid: {density: [[1, 2], [3]], lo: [0, 0, 0], hi: [1, 1, 1]}}", "medium.grid"),
     ("medium: {volume: {file: no.vdb}}", "no such file"),
     ("shapes: [{sphere: {material: gold, centre: [0, 0, 0], radius: 1}}]", "expected one of none, got 'gold'"),
-    ("materials: {g: {dielectric: {ior: 1.5, medium: fig}}}\nmedia: {fog: {homogeneous: {lo: [0, 0, 0], hi: [1, 1, 1]}}}", "did you mean fog?"),
+    ("materials: {g: {dielectric: {ior: 1.5, medium: fig}}}\nmedia: {fog: {homogeneous: {lo: [0, 0, 0], hi: [1, 1, 1]}}}",
+     "did you mean fog?"),
     ("integrators: [pat]", "integrators: expected a list of"),
     ("exposure: -1", "exposure: expected a positive number"),
     ("bounded: 1", "bounded: expected true or false"),

@@ -178,7 +178,8 @@ def frame(plain, width=4, block=1024, shuffle=True, split=True):
 
 
 @pytest.mark.parametrize("n, width, block, shuffle, split", [
-    (5000, 4, 1024, True, True), (4096, 4, 4096, True, True), (900, 4, 4096, True, False), (777, 2, 512, False, True), (3, 4, 64, True, True),
+    (5000, 4, 1024, True, True), (4096, 4, 4096, True, True), (900, 4, 4096, True, False),
+    (777, 2, 512, False, True), (3, 4, 64, True, True),
 ])  # fmt: skip
 def test_blosc_frames(n, width, block, shuffle, split):
     plain = (np.arange(n) // 37 % 11).astype(np.uint8).tobytes()

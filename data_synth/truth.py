@@ -1,0 +1,95 @@
+"""truth.npz: what a scene is made of, exactly, as arrays of numbers that need no data_synth to be read.
+
+| array                                   | content                                                                     |
+|-----------------------------------------|-----------------------------------------------------------------------------|
+| ``mediumK_kind``                        | homogeneous, grid or exponential; K = 0, 1, ... as boundaries number them    |
+| ``mediumK_lo``, ``_hi``                 | its box                                                                     |
+| ``mediumK_sigma_t``                     | (3,) extinction per density in 1/u                                          |
+| ``mediumK_density``, ``_attribute``     | samples at the vertices of a grid from lo to hi; the attribute only if any  |
+| ``mediumK_height``                      | exponential: density exp(-(z - lo_z) / height)                              |
+| ``mediumK_albedo``, ``_Le``             | (n, 3) tables over the attribute in [0, 1], linear in between               |
+| ``mediumK_phase``, ``_g``, ``_S``       | its name; g1, g2 and the weight of the first lobe; (n, 6) SGGX matrices     |
+| ``number``, ``number_lo``, ``number_hi``| medium at each vertex of a grid, -1 for none; media are cut by boundaries   |
+| ``shapes``, ``triangles``, ``materials``| tables as ``surfaces`` and ``materials`` describe them                      |
+| ``layers``, ``lights``                  | tables as ``spongecake`` and ``lights`` describe them                       |
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data_synth import materials as stuff
+from data_synth import media, surfaces
+from data_synth.image import replacing
+
+if TYPE_CHECKING:
+    from data_synth.scene import Scene
+
+RESOLUTION = 64  # cells along the longest side of ``number``
+KINDS = {media.HOMOGENEOUS: "homogeneous", media.GRID: "grid", media.EXPONENTIAL: "exponential"}
+PHASES = ("isotropic", "rayleigh", "henyey_greenstein", "sggx_specular", "sggx_diffuse")
+
+
+def write(scene: Scene, path: Path) -> None:
+    """Write the file."""
+    arrays: dict[str, np.ndarray] = {}
+    for k, m in enumerate((scene.medium, *scene.media)):
+        if m is not None:
+            arrays |= {f"medium{k}_{name}": np.asarray(value) for name, value in _medium(m).items()}
+    lo, hi, number = numbers(scene)
+    geometry = surfaces.geometry(scene.shapes, scene.triangles)
+    arrays |= {
+        "number": number, "number_lo": lo, "number_hi": hi, "shapes": geometry.shapes, "triangles": geometry.triangles,
+        "materials": scene.boundaries(), "layers": np.array(scene.layers, float).reshape(-1, 10),
+        "lights": np.array(scene.lights, float).reshape(-1, 16),
+    }  # fmt: skip
+    with replacing(path) as temporary:
+        np.savez_compressed(temporary, allow_pickle=False, **arrays)
+
+
+def _medium(m: media.Medium) -> dict[str, object]:
+    out: dict[str, object] = {
+        "kind": KINDS[m.kind], "lo": m.lo, "hi": m.hi, "sigma_t": m.sigma_t, "albedo": m.albedo, "Le": m.Le,
+        "phase": PHASES[m.phase.kind], "g": (m.phase.g1, m.phase.g2, m.phase.mix), "S": m.phase.S,
+    }  # fmt: skip
+    if m.kind == media.GRID:
+        out["density"] = media.dense(m)
+        if m.attributes.size > 1:
+            out["attribute"] = media.dense(m._replace(samples=m.attributes))
+    if m.kind == media.EXPONENTIAL:
+        out["height"] = 1.0 / m.falloff
+    return out
+
+
+def numbers(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(lo, hi, (nx, ny, nz) int8): the number of the medium at the vertices of a grid over the media's boxes.
+
+    Boundaries are spheres, boxes and half-spaces; those made of triangles count as the ambient medium.
+    """
+    boxes = [(m.lo, m.hi) for m in (scene.medium, *scene.media) if m is not None] or [tuple(scene.aabb)]
+    lo, hi = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    cells = np.maximum(np.rint((hi - lo) / (hi - lo).max() * RESOLUTION).astype(int), 1)
+    p = np.stack(np.meshgrid(*[np.linspace(a, b, n + 1) for a, b, n in zip(lo, hi, cells, strict=True)], indexing="ij"), -1)
+    ambient = stuff.CLEAR if scene.bounded or scene.medium is None else 0
+    number, best = np.full(p.shape[:3], ambient, np.int8), np.full(p.shape[:3], -np.inf)
+    rows, shapes = scene.boundaries(), surfaces.geometry(scene.shapes).shapes
+    for shape in sorted(shapes, key=lambda shape: shape[1]):  # of equal priorities the later material counts
+        row = rows[int(shape[1])]
+        if row[0] in (stuff.DIELECTRIC, stuff.NULL) and row[15] >= 0:
+            here = _holds(shape, p) & (row[14] >= best)
+            number[here], best[here] = row[13], row[14]
+    for k, m in enumerate((scene.medium, *scene.media)):
+        if m is not None:
+            number[(number == k) & ~((p >= m.lo) & (p <= m.hi)).all(axis=-1)] = stuff.CLEAR
+    return lo, hi, number
+
+
+def _holds(shape: np.ndarray, p: np.ndarray) -> np.ndarray:
+    if shape[0] == surfaces.PLANE:
+        return (p - shape[2:5]) @ shape[5:8] < 0
+    if shape[0] == surfaces.SPHERE:
+        return ((p - shape[2:5]) ** 2).sum(axis=-1) < shape[5] ** 2
+    return ((p > shape[2:5]) & (p < shape[5:8])).all(axis=-1)

@@ -1,0 +1,57 @@
+"""truth.npz: the numbers alone, read without data_synth, say where every medium is and what it does."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_synth import media, scene_file, scenes
+from data_synth.scene import Scene
+
+
+def written(scene, tmp_path):
+    scene.write_truth(tmp_path)
+    with np.load(tmp_path / "truth.npz", allow_pickle=False) as stored:
+        return dict(stored)
+
+
+def vertices(truth):
+    n = truth["number"].shape
+    axes = [np.linspace(a, b, k) for a, b, k in zip(truth["number_lo"], truth["number_hi"], n, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+@pytest.mark.parametrize("name", [n for n in scenes.SCENES if n != "showcase"])
+def test_every_scene_has_its_truth(name, tmp_path):
+    resolution = {"resolution": 16} if "resolution" in scenes.parameters_of(name) else {}
+    scene = scenes.make(name, **resolution)
+    assert isinstance(scene, Scene)
+    truth = written(scene, tmp_path)
+    assert len(truth["lights"]) == len(scene.lights) and len(truth["shapes"]) == len(scene.shapes)
+    m = scene.medium
+    assert ("medium0_kind" in truth) == (m is not None)
+    if m is None:
+        assert (truth["number"] == -1).all()
+    else:
+        assert (truth["number"] == 0).any() and tuple(truth["medium0_sigma_t"]) == m.sigma_t
+        assert np.array_equal(truth["medium0_albedo"], m.albedo) and np.array_equal(truth["medium0_Le"], m.Le)
+        if m.kind == media.GRID:
+            assert np.array_equal(truth["medium0_density"], media.dense(m))
+
+
+def test_attributes_are_written_at_their_samples(tmp_path):
+    a = np.random.default_rng(0).random((10, 11, 12)).astype(np.float32)
+    scene = Scene(medium=media.grid(np.ones_like(a), (0, 0, 0), (1, 1, 1), attribute=a, Le=[0.0, 1.0]))
+    assert np.array_equal(written(scene, tmp_path)["medium0_attribute"], a)
+
+
+def test_boundaries_say_which_medium_is_where(tmp_path):
+    """A ball of ink in a ball of glass in a box of fog."""
+    truth = written(scene_file.load(Path(__file__).parents[2] / "examples" / "scene.yaml"), tmp_path)
+    p = vertices(truth)
+    r = np.linalg.norm(p - (-0.4, -0.2, -0.25), axis=-1)
+    want = np.where(r < 0.3, 1, np.where(r < 0.5, -1, 0))
+    clear_cut = (abs(r - 0.3) > 1e-9) & (abs(r - 0.5) > 1e-9)
+    assert np.array_equal(truth["number"][clear_cut], want[clear_cut]) and set(np.unique(want)) == {-1, 0, 1}
+    assert truth["medium0_kind"] == "exponential" and truth["medium0_height"] == pytest.approx(0.5)
+    assert truth["medium1_sigma_t"].tolist() == [6.0, 3.0, 0.8] and truth["medium0_phase"] == "henyey_greenstein"
