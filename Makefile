@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint sanitize clang no-compiler clients wasm clean
+.PHONY: demo test lint sanitize clang no-compiler clients wasm mutants fuzz clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -46,6 +46,16 @@ wasm:
 clients: $(BIN)/python
 	$(BIN)/pip install -q numpy bpy vtk
 	$(BIN)/python tools/clients.py $(EXPORTS)
+
+# Bugs planted one at a time in a copy: each must be seen by the tests; survivors are printed. Half an hour on two cores.
+mutants: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]' cmake ninja nanobind
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python tools/mutants.py
+
+# Files of every kind, damaged where their structure is: one sentence each, or a find that its seed repeats. SECONDS=60 SEED=0.
+fuzz: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]'
+	$(BIN)/python tools/fuzz.py --seconds $(or $(SECONDS),60) --seed $(or $(SEED),0)
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.cameras.through_lens import through_lens
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 from nerfvol.kernels import ops
 from nerfvol.kernels.splat_ops import render_splats
 from nerfvol.kernels.splat_state import view_of
@@ -212,8 +212,8 @@ class SplatModel:
     def __init__(self, splats: Splats | PackedSplats, metadata: Mapping[str, Any] | None = None) -> None:
         self.packed, self.metadata = as_packed(splats), dict(metadata or {})
         near = self.metadata.get("near")
-        if near is not None and (type(near) not in (int, float) or not 0 < near < np.inf):
-            raise InputError(f"splats: near must be a positive number, got {near!r:.60}")
+        if near is not None and (type(near) not in (int, float) or not 0 < near < 1e30):
+            raise InputError(f"splats: near must be a positive number, got {shown(near):.60}")
         self.near = NEAREST * self._extent() if near is None else float(near)
 
     @property

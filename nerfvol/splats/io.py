@@ -5,7 +5,6 @@ Exact by default; "compact" files hold codes (splats/codec.py), as pages do.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol import __version__
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.octree.codec import plane_name
 from nerfvol.splats import codec
@@ -133,19 +132,19 @@ def _check_document(file: ArrayFile) -> None:
     )
     for key, known in expected:
         if document.get(key) not in known:
-            raise file.fault(f"its {key} is {document.get(key)!r}, expected {' or '.join(map(str, known))}")
+            raise file.fault(f"its {key} is {shown(document.get(key))}, expected {' or '.join(map(str, known))}")
     if document.get("storage", "float32") not in ("float32", "compact"):
-        raise file.fault(f"its storage is {document.get('storage')!r}, expected float32 or compact")
+        raise file.fault(f"its storage is {shown(document.get('storage'))}, expected float32 or compact")
     degree, n, origin = document.get("sh_degree"), document.get("n"), document.get("origin")
     if type(degree) is not int or not 0 <= degree <= 3:
-        raise file.fault(f"its sh_degree is {degree!r}, expected 0, 1, 2 or 3")
+        raise file.fault(f"its sh_degree is {shown(degree)}, expected 0, 1, 2 or 3")
     if type(n) is not int or not 0 <= n < 1 << 31:
-        raise file.fault(f"its n is {n!r}, expected a count")
+        raise file.fault(f"its n is {shown(n)}, expected a count")
     if not isinstance(origin, list) or len(origin) != 3 or not all(_is_place(x) for x in origin):
-        raise file.fault(f"its origin is {origin!r}, expected three finite numbers")
+        raise file.fault(f"its origin is {shown(origin)}, expected three finite numbers")
     if not isinstance(document.get("metadata"), dict):
         raise file.fault("its metadata is not a JSON object")
 
 
 def _is_place(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value) and abs(value) <= LARGEST_VALUE
+    return type(value) in (int, float) and abs(value) <= LARGEST_VALUE

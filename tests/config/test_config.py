@@ -299,3 +299,21 @@ def test_a_distilled_octree_has_the_bands_of_the_octree_section(octree, distill,
     """Unless its own says otherwise."""
     config = assemble(Config, ({"octree": octree, "distill": distill}, "a.yaml"))
     assert config.for_scene(SceneBounds([[-1] * 3, [1] * 3], None, True)).distill.sh_degree == degree
+
+
+@pytest.mark.parametrize("text, reason", [
+    ("a: &x [1, 2]\nb: *x", "aliases are not read at line 2"), ("a: 1\na: 2", "'a' is stated twice at line 2"),
+    ("a: " + "9" * 5000, "number or date"), ("a: 2000-99-99", "number or date"),
+])  # fmt: skip
+def test_yaml_that_grows_or_says_two_things_is_refused(tmp_path, text, reason):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(InputError, match=reason):
+        read_yaml(tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize(
+    "setting", [{"seed": -1}, {"threads": 100_000}, {"background": [10**400, 0, 0]}, {"seed": 10**400}]
+)
+def test_numbers_beyond_all_sense_are_a_sentence(setting):
+    with pytest.raises(InputError, match="^a.yaml: "):
+        assemble(Config, (setting, "a.yaml"))

@@ -157,3 +157,12 @@ def test_sizes_between_pillows_limits_are_refused_too(tmp_path):
     path.write_bytes(png_bytes(random_images(1)[0], declared=(side, side)))
     with pytest.raises(InputError, match=f"declares {side}x{side}"):
         image_size(path)
+
+
+@pytest.mark.parametrize("name", ["GIF", "PPM", "ICO", "DDS", "EPS"])
+def test_other_formats_are_refused_whatever_the_name(tmp_path, name):
+    """Pillow goes by the content, and hands PostScript to another program: only the decoders in use are reached."""
+    path = tmp_path / "a.png"
+    Image.new("RGB", (8, 8)).save(path, format=name)
+    with pytest.raises(InputError, match="expected a PNG, JPEG, WEBP, BMP or TIFF image"):
+        read_image(path)

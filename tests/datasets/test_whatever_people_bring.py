@@ -77,7 +77,9 @@ def test_one_camera_that_looks_elsewhere_does_not_move_the_point_that_all_look_a
 
 
 def test_one_picture_of_another_size_is_left_out(tmp_path):
-    folder = scene(tmp_path, 24, change=lambda d: [d.pop(k) for k in ("w", "h", "fl_x", "fl_y")] and d.update(camera_angle_x=0.8))
+    folder = scene(
+        tmp_path, 24, change=lambda d: [d.pop(k) for k in ("w", "h", "fl_x", "fl_y")] and d.update(camera_angle_x=0.8)
+    )
     Image.new("RGB", (25, 16)).save(folder / "images" / "view_005.png")
     dataset = load_dataset(folder)
     assert "view_005" not in dataset.names and len(dataset) == 20
@@ -251,7 +253,9 @@ def test_photographs_are_turned_where_their_calibration_is_for_upright_ones(tmp_
 
     folder = scene(tmp_path)
     for path in (folder / "images").iterdir():
-        image = Image.fromarray(np.random.default_rng(3).integers(0, 255, (16, 24, 3) if orientation < 5 else (24, 16, 3), np.uint8))
+        image = Image.fromarray(
+            np.random.default_rng(3).integers(0, 255, (16, 24, 3) if orientation < 5 else (24, 16, 3), np.uint8)
+        )
         exif = image.getexif()
         exif[0x0112] = orientation
         image.save(path, exif=exif)
@@ -266,7 +270,9 @@ def test_photographs_are_turned_where_their_calibration_is_for_upright_ones(tmp_
 # ------------------------------------------------------------------ lists and files
 def test_a_list_of_training_views_alone_is_kept_to(tmp_path):
     def lists(document):
-        document["train_filenames"] = [f["file_path"].replace("images/", "./images\\") for f in document["frames"][::2]] + ["no.png"]
+        document["train_filenames"] = [
+            f["file_path"].replace("images/", "./images\\") for f in document["frames"][::2]
+        ] + ["no.png"]
 
     folder = scene(tmp_path, change=lists)
     train, held = load_dataset(folder), load_dataset(folder, "val")

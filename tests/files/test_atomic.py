@@ -3,8 +3,10 @@
 import errno
 import json
 import os
+import stat
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -127,3 +129,37 @@ def test_ensure_writable_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "write_bytes", refuse)
     with pytest.raises(InputError, match="cannot write into .*permission denied"):
         atomic.ensure_writable_folder(tmp_path / "a")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_what_is_written_to_a_pipe_goes_through_it(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    got = []
+    reader = threading.Thread(target=lambda: got.append(pipe.read_bytes()))
+    reader.start()
+    atomic.write_text(pipe, "through")
+    reader.join(10)
+    assert got == [b"through"] and stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_link_stays_one_and_what_it_names_is_written(tmp_path):
+    (tmp_path / "disk").mkdir()
+    real, link = tmp_path / "disk" / "real.json", tmp_path / "link.json"
+    real.write_text("old")
+    link.symlink_to("disk/real.json")
+    atomic.write_json(link, [1])
+    assert link.is_symlink() and json.loads(real.read_text()) == [1]
+    dangling = tmp_path / "new.json"
+    dangling.symlink_to("disk/new.json")
+    atomic.write_json(dangling, [2])
+    assert json.loads((tmp_path / "disk" / "new.json").read_text()) == [2]
+
+
+@pytest.mark.parametrize("text, reason", [
+    ('{"a": 1, "b": {"c": 1, "c": 2}}', "states 'c' twice"), ("[" + "9" * 5000 + "]", "thousands of digits"),
+])  # fmt: skip
+def test_json_that_says_two_things_or_too_much_is_refused(tmp_path, text, reason):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match=reason):
+        atomic.read_json(tmp_path / "a.json")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 
 from nerfvol.errors import InputError
+from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.octree import codec, io
 from nerfvol.octree.io import describe_octree, load_octree, save_octree
 from nerfvol.octree.topology import morton
@@ -389,3 +390,26 @@ def test_fuzzed_masks(tmp_path, masks, n):
     except InputError:
         return
     octree.validate()
+
+
+@pytest.mark.parametrize("key, value", [
+    ("size", 10**400), ("origin", [0, 0, 10**400]), ("aabb", "big"), ("nerfvol", 5), ("n_vertices", True), ("density_scale", "9"),
+])  # fmt: skip
+def test_headers_that_lie_are_one_sentence(tmp_path, key, value):
+    octree = Octree.from_leaves([1] * 8, np.argwhere(np.ones((2, 2, 2))), [0] * 3, 1.0)
+    path = tmp_path / "a.safetensors"
+    save_octree(path, octree, {}, "float32")
+    with ArrayFile(path, "octree file") as file:
+        document = {**file.document, key: value}
+        arrays = {name: file.read(name) for name in file.shapes}
+    write_arrays(path, arrays, document)
+    with pytest.raises(InputError, match=f"its {key}|it says that nerfvol"):
+        load_octree(path)
+
+
+def test_what_would_not_fit_into_memory_is_refused_before_it_is_made(tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    save_octree(path, Octree.from_leaves([1] * 8, np.argwhere(np.ones((2, 2, 2))), [0] * 3, 1.0), {}, "float32")
+    monkeypatch.setattr("nerfvol.machine.available_memory", lambda: 1000)
+    with pytest.raises(InputError, match="GiB of memory"):
+        load_octree(path)

@@ -40,7 +40,9 @@ def test_a_fingerprint_knows_what_changed(dataset):
     assert "1 are new" in changes(fingerprint(fewer), before)
     images = [image.copy() for image in dataset.images]
     images[2][0, 0, 0] ^= 1
-    assert f"1 have other pixels or masks ({dataset.names[2]})" in changes(before, fingerprint(changed(dataset, images=images)))
+    assert f"1 have other pixels or masks ({dataset.names[2]})" in changes(
+        before, fingerprint(changed(dataset, images=images))
+    )
     poses = [dataclasses.replace(c, c2w=c.c2w.copy()) for c in dataset.cameras]
     poses[1].c2w[0, 3] += 1e-2
     assert f"1 have another pose ({dataset.names[1]})" in changes(before, fingerprint(changed(dataset, cameras=poses)))
@@ -96,7 +98,9 @@ def test_a_frame_brings_a_scene_near_and_back(dataset, scale, shift):
         np.testing.assert_allclose(a.position, b.position, atol=atol, rtol=0)
 
 
-@pytest.mark.parametrize("scale, shift", [(1.0, (441547.5, 5121946.5, 2345.25)), (1e-6, (0, 0, 0)), (2.0**27, (3e9, 0, 0))])
+@pytest.mark.parametrize(
+    "scale, shift", [(1.0, (441547.5, 5121946.5, 2345.25)), (1e-6, (0, 0, 0)), (2.0**27, (3e9, 0, 0))]
+)
 def test_pictures_do_not_depend_on_where_the_scene_lies(dataset, scale, shift):
     rng = np.random.default_rng(0)
     octree = Octree.from_leaves([1] * 8, np.argwhere(np.ones((2, 2, 2))), [-0.5] * 3, 1.0, density_scale=9.0)
@@ -157,3 +161,25 @@ def test_a_preview_that_cannot_be_written_is_a_warning(tiny_scene, tmp_path, mon
     told = []
     start(settings(tiny_scene, tmp_path / "run"), say=told.append)
     assert any(s.startswith("warning: cannot write") and "without this preview" in s for s in told)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e8])
+def test_models_of_a_frame_come_back_looking_the_same(scale):
+    """Octree and splats: sizes times the scale, densities over it, so that optical depths stay."""
+    from nerfvol.splats.splats import Splats
+
+    frame = Frame(np.array([5e6, 4e5, 10.0]), scale)
+    octree = Octree.from_leaves([1] * 8, np.argwhere(np.ones((2, 2, 2))), [-0.5] * 3, 1.0, density_scale=9.0)
+    back = frame.octree_back(octree)
+    np.testing.assert_allclose([back.size, back.size * back.density_scale], [scale, 9.0])
+    np.testing.assert_allclose(back.origin, frame.shift - 0.5 * scale, rtol=1e-15)
+    rng = np.random.default_rng(0)
+    splats = Splats(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), rng.normal(size=(5, 4)), rng.normal(size=5),
+                    rng.normal(size=(5, 3, 1)), origin=np.array([1.0, 2, 3]))  # fmt: skip
+    again = frame.splats_into(frame.splats_back(splats))
+    np.testing.assert_allclose(again.means, splats.means, rtol=1e-6)
+    np.testing.assert_allclose(again.log_scales, splats.log_scales, atol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(frame.splats_back(splats).log_scales), scale * np.exp(splats.log_scales), rtol=1e-5
+    )
+    np.testing.assert_allclose(frame.splats_back(splats).origin, frame.back(splats.origin), rtol=1e-15)
