@@ -26,7 +26,10 @@ def parallax(pairs: Sequence[tuple[Points, Points]], focals: Sequence[float] = F
     chosen = np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).round().astype(int)) if pairs else []
     if not len(chosen):
         return -1.0
-    return min(float(np.quantile([_left_by_rotation(pairs[i][0], pairs[i][1], focal) for i in chosen], 0.9)) for focal in focals)
+    return min(
+        float(np.quantile([_left_by_rotation(pairs[i][0], pairs[i][1], focal) for i in chosen], 0.9))
+        for focal in focals
+    )
 
 
 def _left_by_rotation(a: Points, b: Points, focal: float) -> float:
