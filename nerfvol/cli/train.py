@@ -44,7 +44,7 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--poses", metavar="given|auto", help="auto: photographs without poses, or a video, get them first, in "
                    "RUN/scene (needs nerfvol[poses]; default: given)")  # fmt: skip
     p.add_argument("--appearance", metavar="auto|on|off", help="a colour map for each photograph; auto: where exposures "
-                   "differ by more than 2 %% (default: auto)")  # fmt: skip
+                   "differ by more than 8 %% (default: auto)")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--view", action="store_true", help="show the model in the browser while it is trained, a new one after "

@@ -378,7 +378,7 @@ class Config(Checked):
     """auto: photographs without poses, or a video, get them first (`nerfvol poses`), in RUN/scene."""
     appearance: Literal["auto", "on", "off"] = "auto"
     """A colour map for each photograph, for exposure and white balance that differ. auto: where exposures spread by more
-    than 2 %; off: photographs are taken as they are."""
+    than 8 %; off: photographs are taken as they are."""
     aabb: Annotated[tuple[float, float, float, float, float, float] | None, box] = None
     """The region of detail, lowest and highest corner in the units of the poses; None: worked out from the cameras."""
     holdout: Literal["own", "arc"] = "own"

@@ -98,7 +98,13 @@ def test_other_pictures_or_settings_begin_anew(photos, tmp_path):
 def test_the_bar_never_steps_back():
     shares = []
     bar = Progress(lambda step, share: shares.append(share))
-    for step, done in (("frames", 1), ("features", 3), ("matching", 8), ("global mapping", 10), ("incremental mapping", 1)):
+    for step, done in (
+        ("frames", 1),
+        ("features", 3),
+        ("matching", 8),
+        ("global mapping", 10),
+        ("incremental mapping", 1),
+    ):
         bar.at(step, done, 10)
     assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1
 

@@ -53,7 +53,10 @@ def test_what_needs_no_change_is_copied_byte_by_byte(tmp_path):
 
 def test_groups_by_size_camera_and_focal_length(tmp_path):
     paths = [save(tmp_path / f"in/a{i}.jpg", model="P1", focal=4.2, film=27) for i in range(3)]
-    paths += [save(tmp_path / "in/zoomed.jpg", model="P1", focal=9.0, film=58), save(tmp_path / "in/other.jpg", size=(30, 40))]
+    paths += [
+        save(tmp_path / "in/zoomed.jpg", model="P1", focal=9.0, film=58),
+        save(tmp_path / "in/other.jpg", size=(30, 40)),
+    ]
     photographs, _ = copy_photographs(paths, tmp_path / "out", 1000)
     groups = camera_groups(photographs)
     assert [len(group.names) for group in groups] == [3, 1, 1]

@@ -33,8 +33,12 @@ def test_a_walk_comes_back_to_a_pixel(scene):
     root, report, _ = scene
     truth = walk(N, 0, 0.2)
     assert report["registered"] == N and report["left_out"] == []
-    views = [*zip(*[(d.names, d.cameras) for d in (load_dataset(root / "scene", s) for s in ("train", "val"))], strict=True)]
-    found = {name: camera for names, cameras in zip(*views, strict=True) for name, camera in zip(names, cameras, strict=True)}
+    views = [
+        *zip(*[(d.names, d.cameras) for d in (load_dataset(root / "scene", s) for s in ("train", "val"))], strict=True)
+    ]
+    found = {
+        name: camera for names, cameras in zip(*views, strict=True) for name, camera in zip(names, cameras, strict=True)
+    }
     cameras = [found[f"view_{i:03d}"] for i in range(N)]
     scale, rotation, shift = align(np.stack([c.position for c in cameras]), np.stack([c.position for c in truth]))
     pixel = 1 / LENS.fx
@@ -50,7 +54,9 @@ def test_a_walk_comes_back_to_a_pixel(scene):
 def test_the_report_says_what_happened(scene):
     root, report, _ = scene
     assert json.loads((root / "scene" / "poses.json").read_text()) == report
-    assert report["error_pixels"] < 1 and report["median_features"] > 100 and report["mapper"] in ("global", "incremental")
+    assert (
+        report["error_pixels"] < 1 and report["median_features"] > 100 and report["mapper"] in ("global", "incremental")
+    )
     assert report["groups"][0]["focal_from"] == "guessed"
     assert not (root / "scene" / "poses_work").exists()
 

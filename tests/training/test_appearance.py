@@ -88,6 +88,18 @@ def test_a_poor_model_is_no_exposure():
     assert not appearance.fit(seen, MOMENTS[0])
 
 
+def test_fog_takes_no_bright_side_for_an_exposure():
+    """A grey model says nothing of why photographs differ; the question is asked again once it shows something."""
+    scene = np.random.default_rng(0).uniform(0, 0.7, (20, 30, 3))
+
+    def fog(i):
+        return GAINS[i] * scene, np.full_like(scene, 0.35), np.ones(scene.shape[:2])
+
+    appearance = Appearance(12)
+    assert not appearance.fit(fog, MOMENTS[0]) and not appearance.decided and appearance.due(MOMENTS[1])
+    assert appearance.fit(seen_with(GAINS, scene), MOMENTS[1])
+
+
 def test_uneven_photographs_come_to_one_exposure():
     scene = np.random.default_rng(0).uniform(0, 0.75, (20, 30, 3))
     appearance = Appearance(12)
