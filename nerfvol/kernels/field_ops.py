@@ -166,7 +166,8 @@ def render_rays(
     d = rows_of_three("rays_d", rays_d, len(o))
     if unknown := set(outputs) - set(OUTPUTS):
         raise ValueError(f"outputs must be among {OUTPUTS}, got {sorted(unknown)}")
-    terms = _check_loss(FieldLoss(tuple(check_background(background)), early_stop_eps=early_stop_eps))
+    red, green, blue = check_background(background)
+    terms = _check_loss(FieldLoss((red, green, blue), early_stop_eps=early_stop_eps))
     compiled = native()
     assert compiled is not None
     out = {k: np.empty((len(o), 3) if k == "rgb" else len(o), np.float32) for k in OUTPUTS if k in outputs}

@@ -10,7 +10,8 @@ tau_i = sigma_i delta_i, T_i = exp(-sum_{j<i} tau_j), w_i = T_i (1 - exp(-tau_i)
          + distortion mean_rays (sum_ij w_i w_j |m_i - m_j| + sum w_i^2 delta_i / 3) + entropy mean_rays H(T)
 
 means over rays and channels where nothing else is said; m and delta in edges of the inner cube;
-H(T) = -T log T - (1 - T) log(1 - T), T limited to [1e-4, 1 - 1e-4]. The network, its encodings and its head are ``nerfvol.field.fields``.
+H(T) = -T log T - (1 - T) log(1 - T), T limited to [1e-4, 1 - 1e-4]. The network, its encodings and its head are
+``nerfvol.field.fields``.
 """
 
 from __future__ import annotations
@@ -178,11 +179,12 @@ def train_step(
             assert state.levels is not None
             part = slice(state.levels.starts[level], state.levels.starts[level + 1])
             state.updates[level] += 1
-            arrays = [getattr(state, "table" + name)[part] for name in ("", "_first", "_second", "_gradient")]
-            adam(*arrays, rates, rates.table_decay, int(state.updates[level]))
-            arrays[3][...] = 0
+            values, gradient = state.table[part], state.table_gradient[part]
+            first, second = state.table_first[part], state.table_second[part]
+            adam(values, first, second, gradient, rates, rates.table_decay, int(state.updates[level]))
+            gradient[...] = 0
     state.updates[-1] += 1
-    moments = (state.network, state.network_first, state.network_second)
-    adam(*moments, network.numpy(), rates, rates.network_decay, int(state.updates[-1]))
+    first, second = state.network_first, state.network_second
+    adam(state.network, first, second, network.numpy(), rates, rates.network_decay, int(state.updates[-1]))
     samples = march_rays(state, batch, march)
     return FieldStepReport(float(total), float("nan"), len(samples.t_starts), len(samples.t_starts))

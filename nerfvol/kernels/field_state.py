@@ -86,6 +86,15 @@ class FieldState:
 
     ARRAYS = tuple(f"{name}{part}" for name in ("table", "network") for part in ("", "_first", "_second", "_gradient"))
 
+    table: Float
+    table_first: Float
+    table_second: Float
+    table_gradient: Float
+    network: Float
+    network_first: Float
+    network_second: Float
+    network_gradient: Float
+
     def __init__(self, domain: Domain, shape: FieldShape, seed: int = 0) -> None:
         self.domain, self.shape = domain, shape
         self.layers = layers_of(shape)
@@ -180,6 +189,10 @@ class Occupancy:
         threshold = min(most, 0.5 * float((per_cube * self.cell_edges).mean()))
         limits = (threshold / self.cell_edges).astype(np.float32)
         compiled.field_refresh(self.sigmas, limits, self.resolution, self.occupied, self.coarse)
+
+    def thickest(self) -> float:
+        """The largest optical thickness of a cell."""
+        return float((self.sigmas.reshape(self.cubes, -1).max(1) * self.cell_edges).max())
 
     def cells(self) -> NDArray[np.bool_]:
         """(cubes, r, r, r) whether each cell is occupied."""

@@ -216,7 +216,7 @@ class CompiledFieldTrainer:
         else:
             return
         grid.refresh()
-        if not grid.occupied.any():
+        if grid.thickest() < 1 / (255 * math.sqrt(3) * r):  # a whole ray would not change an 8-bit colour
             raise InputError(
                 "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
                 "the images' background and that the scene bounds contain the object, lower field.rate, or start with "

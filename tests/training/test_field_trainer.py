@@ -20,7 +20,7 @@ from nerfvol.training.field_trainer import FieldTrainer, PixelBank, domain_of, i
 TINY = FieldConfig(
     shape=FieldShape(width=16, hash_levels=4, hash_log2_table=10, hash_min=4, hash_max=24),
     steps=60, downscales=(4, 2), stage_ends=(0.3, 1.0), march_steps=(32, 48), samples_per_step=2048,
-    grid_resolution=16,
+    grid_resolution=16, rate=0.01, colour_weight=0.0,
 )  # fmt: skip
 
 

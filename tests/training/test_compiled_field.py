@@ -1,0 +1,150 @@
+"""The trainer by compiled kernels: it learns, resumes to the same bits with any number of threads, empties space, and is chosen."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerfvol.config.training import DistillConfig, FieldConfig, FieldShape
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.errors import InputError
+from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
+from nerfvol.kernels.field_state import FieldState
+from nerfvol.starts.field import distill
+from nerfvol.training import compiled_field
+from nerfvol.training.compiled_field import CompiledFieldTrainer, Pixels
+from nerfvol.training.field_trainer import FieldTrainer, make_field_trainer
+from tests.training.test_field_trainer import ball_dataset
+
+SMALL = FieldConfig(
+    shape=FieldShape(width=16, hash_levels=4, hash_log2_table=10, hash_min=4, hash_max=24),
+    steps=400, march_steps=(64,), samples_per_step=2048, grid_resolution=32, few_views=0,
+)  # fmt: skip
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    return ball_dataset()
+
+
+def trainer_of(dataset: Dataset, config: FieldConfig = SMALL, seed: int = 1) -> CompiledFieldTrainer:
+    trainer = make_field_trainer(dataset, config, seed, WHITE)
+    assert isinstance(trainer, CompiledFieldTrainer)
+    return trainer
+
+
+def assert_same_bits(a: CompiledFieldTrainer, b: CompiledFieldTrainer) -> None:
+    for name in (*FieldState.ARRAYS, "updates"):
+        assert getattr(a.state, name).tobytes() == getattr(b.state, name).tobytes(), name
+    for name, array in a.occupancy.state_dict().items():
+        assert array.tobytes() == b.occupancy.state_dict()[name].tobytes(), name
+    assert (a.steps_done, a.n_rays) == (b.steps_done, b.n_rays)
+
+
+def test_learns_the_ball(compiled, dataset: Dataset) -> None:
+    """Better than any constant image by 12 dB within 400 steps; most of the region is found empty; little is wasted at first."""
+    trainer = trainer_of(dataset)
+    reports = [trainer.step() for _ in range(257)]
+    assert reports[0].samples * reports[0].n_rays <= 4 * SMALL.samples_per_step
+    # The ball fills 0.8**3 pi / 6 of the cube over its bounds of 1.1, a shell of it is seen; all cells at the edge count.
+    assert 0.02 < trainer.occupancy.fraction < 0.5
+    assert reports[-1].n_rays > 2 * reports[0].n_rays
+    reports += [trainer.step() for _ in range(143)]
+    assert abs(np.mean([r.samples * r.n_rays for r in reports[-40:]]) / SMALL.samples_per_step - 1) < 0.1
+    truth = np.stack([dataset.composited(i, WHITE) for i in range(len(dataset))])
+    constant = -10 * math.log10(((truth - truth.mean((0, 1, 2))) ** 2).mean())
+    pictures = np.stack([trainer.picture(camera) for camera in dataset.cameras])
+    assert -10 * math.log10(((pictures - truth) ** 2).mean()) > constant + 12
+
+
+def test_the_same_bits_with_any_number_of_threads_and_resumed(threads, dataset: Dataset, tmp_path: Path) -> None:
+    """Across the first sweep (step 64) and a round of probes, occupancy included; stopped through a checkpoint file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled_field, "SWEEPS", (8, 16))
+        patch.setattr(compiled_field, "PROBE_EVERY", 8)
+        runs = []
+        for n in (1, 2, 3):
+            threads(n)
+            runs.append(trainer_of(dataset))
+            reports = [runs[-1].step().loss for _ in range(28)]
+        first = trainer_of(dataset)
+        for _ in range(19):
+            first.step()
+        save_checkpoint(tmp_path / "c.safetensors", first.state_dict())
+        second = trainer_of(dataset)
+        second.load_state_dict(load_checkpoint(tmp_path / "c.safetensors"))
+        assert [second.step().loss for _ in range(9)] == reports[19:]
+    for other in (*runs[1:], second):
+        assert_same_bits(runs[0], other)
+    assert trainer_of(dataset, seed=2).step().loss != reports[0]
+
+
+def test_a_checkpoint_of_another_network_is_refused(compiled, dataset: Dataset) -> None:
+    state = trainer_of(dataset).state_dict()
+    wider = dataclasses.replace(SMALL, shape=dataclasses.replace(SMALL.shape, width=24))
+    with pytest.raises(InputError, match="does not fit"):
+        trainer_of(dataset, wider).load_state_dict(state)
+    with pytest.raises(InputError, match="does not fit"):
+        trainer_of(dataset, dataclasses.replace(SMALL, grid_resolution=16)).load_state_dict(state)
+
+
+def test_collapse_to_empty_space_is_reported(compiled, dataset: Dataset) -> None:
+    """A field that no picture could show: an error at the next look, not a silent empty result."""
+    trainer = trainer_of(dataset)
+    trainer.state.network[-13] = -30.0  # the raw density's bias, before those of 12 coefficients
+    trainer.steps_done = compiled_field.SWEEPS[0] - 1
+    with pytest.raises(InputError, match="collapsed to empty space"):
+        trainer.step()
+
+
+def test_rays_are_the_cameras_and_colours_the_images(compiled, dataset: Dataset) -> None:
+    """Every ray drawn is some pixel's: origin, direction and colour, at a scale of 2; all views are drawn from."""
+    background = (0.25, 0.5, 0.75)
+    batch = Pixels(dataset, background, 2).sample(4000, seed=3, step=7)
+    images = dataset.pyramid(background, 2)
+    origins = np.stack([camera.position for camera in dataset.cameras]).astype(np.float32)
+    view = (batch.rays_o[:, None] == origins).all(-1).argmax(1)
+    # 4000 / 8 = 500 each, binomial deviation 21.
+    assert (np.abs(np.bincount(view, minlength=8) - 500) < 5 * 21).all()
+    for i, camera in enumerate(dataset.cameras):
+        rows = view == i
+        _, directions = camera.scaled(2).rays()
+        apart = ((batch.rays_d[rows][:, None] - directions) ** 2).sum(-1)
+        pixel = apart.argmin(1)
+        assert apart.min(1).max() < 1e-12
+        np.testing.assert_array_equal(np.rint(batch.target[rows] * 255), images[i].reshape(-1, 3)[pixel])
+        assert len(np.unique(pixel)) > 150  # of 256: 500 draws hit 86 % of them
+    assert 0 <= batch.jitter.min() and batch.jitter.max() < 1 and abs(batch.jitter.mean() - 0.5) < 5 * 0.289 / 63
+    assert not np.array_equal(Pixels(dataset, background, 2).sample(4000, 3, 8).jitter, batch.jitter)
+
+
+def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:
+    trainer = trainer_of(dataset, dataclasses.replace(SMALL, few_views=8))
+    assert trainer.state.shape.sh_degree == 0 and trainer._rates(0.0).table_decay == SMALL.few_decay
+    assert trainer_of(dataset).state.shape.sh_degree == 1
+
+
+@pytest.mark.parametrize("change", [
+    {"sampler": "importance"}, {"trainer": "torch"}, {"sparsity_weight": 0.01},
+    {"shape": dataclasses.replace(SMALL.shape, hash_features=3)},
+])  # fmt: skip
+def test_what_the_kernels_have_not_trains_in_torch(dataset: Dataset, change: dict) -> None:
+    assert isinstance(make_field_trainer(dataset, dataclasses.replace(SMALL, **change)), FieldTrainer)
+
+
+def test_without_kernels_it_trains_in_torch(dataset: Dataset, monkeypatch) -> None:
+    monkeypatch.setattr("nerfvol.kernels.field_ops.native", lambda: None)
+    assert isinstance(make_field_trainer(dataset, SMALL), FieldTrainer)
+
+
+def test_what_is_distilled_is_what_is_drawn(compiled, dataset: Dataset) -> None:
+    """Octree and field of a run that takes a second show the ball alike: better than any constant picture by 12 dB."""
+    trainer = trainer_of(dataset)
+    for _ in range(300):
+        trainer.step()
+    settings = DistillConfig(level=6, coarse_level=4, sh_degree=1)
+    _, report = distill(trainer.trained_field(), trainer.domain, dataset, WHITE, settings, trainer.picture)
+    assert report.field_psnr > 25 and report.octree_psnr > 25
