@@ -138,8 +138,8 @@ class _Layout:
 
     @property
     def _nothing(self) -> bytes:
-        """No values at all, as a node without tiles has them: OpenVDB reads and writes zero bytes, save in half precision, where it
-        returns before it comes to their number."""
+        """No values at all, as a node without tiles has them: OpenVDB reads and writes how many bytes they take, 0, save in half
+        precision, where it returns before."""
         return b"" if self.half else struct.pack("<q", 0)
 
     @property

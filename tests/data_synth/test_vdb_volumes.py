@@ -65,8 +65,8 @@ def test_sparse_grids_far_apart_and_below_zero(tmp_path, half):
 
 @pytest.mark.parametrize("half, sizes", [(False, 16), (True, 0)])
 def test_a_voxel_takes_the_bytes_that_openvdb_reads(tmp_path, half, sizes):
-    """Between a grid's two marks: root, a node of 32^3 and one of 16^3 without values, whose number of bytes (8 each) is there in
-    single precision alone, and a leaf's mask. Our reader would agree with our writer; Blender did not."""
+    """Between a grid's two marks: root, a node of 32^3 and one of 16^3 without values, whose number of bytes (8 each) is in
+    files of single precision alone, and a leaf's mask. Our reader would agree with our writer; Blender did not."""
     grid = SparseGrid("density", np.array([[3, 4, 5]]), np.array([0.5]))
     write_grids(tmp_path / "a.vdb", [grid], half)
     data = (tmp_path / "a.vdb").read_bytes()
