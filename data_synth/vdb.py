@@ -203,6 +203,8 @@ class _Tree:
         return flat if self.channels == 1 else flat.reshape(n, self.channels)
 
     def _flat(self, n: int) -> np.ndarray:
+        if self.half and not n:  # OpenVDB's half reader returns before it reads how many bytes there are
+            return np.zeros(0, np.float32)
         kind = "<f2" if self.half else "<f4"
         if not self.flags & (ZIP | BLOSC):
             return self.r.numbers(kind, n).astype(np.float32)

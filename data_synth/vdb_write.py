@@ -137,6 +137,12 @@ class _Layout:
             raise InputError(f"{path}: indices of the grid {name} lie beyond {FARTHEST}")
 
     @property
+    def _nothing(self) -> bytes:
+        """No values at all, as a node without tiles has them: OpenVDB reads and writes how many bytes they take, 0, save in half
+        precision, where it returns before."""
+        return b"" if self.half else struct.pack("<q", 0)
+
+    @property
     def type_name(self) -> str:
         return f"Tree_{'vec3s' if self.vector else 'float'}_5_4_3{'_HalfFloat' if self.half else ''}"
 
@@ -173,7 +179,7 @@ class _Layout:
     def _node(self, children: np.ndarray, size: int) -> bytes:
         child = np.zeros(size, bool)
         child[children] = True
-        return _bits(child) + bytes(size // 8) + _OUTSIDE_IS_BACKGROUND + struct.pack("<q", 0)  # no tiles
+        return _bits(child) + bytes(size // 8) + _OUTSIDE_IS_BACKGROUND + self._nothing
 
     def _mask(self, leaf: int) -> bytes:
         active = np.zeros(512, bool)

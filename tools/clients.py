@@ -60,7 +60,8 @@ def describe_with_blender(bpy: Any, path: Path) -> str:
     if path.suffix == ".vdb":
         volume = load_volume(bpy, path)
         grids = ", ".join(f"{grid.name} ({grid.data_type})" for grid in volume.data.grids)
-        return f"volume, dimensions {tuple(round(x, 3) for x in volume.dimensions)}; grids {grids}"
+        corners = corners_of(bpy, volume)
+        return f"volume, {corners.min(axis=0).round(3)} to {corners.max(axis=0).round(3)}; grids {grids}"
     {".glb": lambda p: bpy.ops.import_scene.gltf(filepath=p), ".ply": lambda p: bpy.ops.wm.ply_import(filepath=p),
      ".obj": lambda p: bpy.ops.wm.obj_import(filepath=p)}[path.suffix](str(path))  # fmt: skip
     item = next(o for o in bpy.context.scene.objects if o.type == "MESH")
@@ -84,6 +85,13 @@ def load_volume(bpy: Any, path: Path) -> Any:
     data.grids.load()
     bpy.context.view_layer.update()
     return item
+
+
+def corners_of(bpy: Any, item: Any) -> np.ndarray:
+    """(8, 3) of the box around an object as Blender evaluates it."""
+    whole = item.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    matrix = np.array(item.matrix_world)
+    return np.array([tuple(c) for c in whole.bound_box]) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def volume_material(bpy: Any) -> Any:
@@ -121,7 +129,7 @@ def render(bpy: Any, path: Path, picture: Path, side: int, samples: int) -> None
         item = next(o for o in scene.objects if o.type == "MESH")
     import mathutils
 
-    corners = np.array([item.matrix_world @ mathutils.Vector(c) for c in item.bound_box])
+    corners = corners_of(bpy, item)
     middle, reach = corners.mean(axis=0), float(np.linalg.norm(np.ptp(corners, axis=0))) / 2
     lens = bpy.data.cameras.new("camera")
     lens.angle = math.radians(40)

@@ -64,6 +64,23 @@ def test_even_keyframes_are_catmull_rom_and_shoemake():
     assert np.allclose(middle, (-places[0] + 9 * places[1] + 9 * places[2] - places[3]) / 16)  # Catmull-Rom at 1/2
 
 
+def test_uneven_keyframes_by_barry_and_goldman():
+    """Halfway between the middle two of four, through their pyramid of linear interpolations at centripetal knots (1988)."""
+    places = np.array([[0, 0, 0], [0.2, 0.1, 0], [2, 1, 1], [2.5, -1, 3.0]])
+    keys = [Camera(LENS, np.column_stack([np.eye(3), place])) for place in places]
+    t = np.concatenate([[0], np.cumsum(np.sqrt(np.linalg.norm(np.diff(places, axis=0), axis=1)))])
+    at = (t[1] + t[2]) / 2
+    level = list(places)
+    for width in (1, 2, 2):  # the last one between the knots of the segment
+        first = 1 if width == 2 and len(level) == 2 else 0
+        ends = [(t[i + first], t[i + first + (width if first == 0 else 1)]) for i in range(len(level) - 1)]
+        level = [((b - at) * p + (at - a) * q) / (b - a) for (a, b), p, q in zip(ends, level, level[1:], strict=False)]
+    spans = np.linspace(0, t[-1], 20001)
+    path = interpolated(keys, 20001)
+    nearest = path[int(np.argmin(np.abs(spans - at)))].position
+    assert np.abs(nearest - level[0]).max() < 5e-4 * t[-1]
+
+
 def test_lenses_sizes_and_doubled_keyframes():
     a, b = Camera(LENS, np.eye(4)), Camera(Intrinsics(32, 48, 140.0, 140.0, 16.0, 24.0), np.diag([1.0, 1, 1, 1]))
     moved = np.eye(4)

@@ -65,6 +65,21 @@ def test_sparse_grids_far_apart_and_below_zero(tmp_path, half):
     assert read_vdb(tmp_path / "a.vdb").values.ndim == 3
 
 
+@pytest.mark.parametrize("half, sizes", [(False, 16), (True, 0)])
+def test_a_voxel_takes_the_bytes_that_openvdb_reads(tmp_path, half, sizes):
+    """Between a grid's two marks: root, a node of 32^3 and one of 16^3 without values, whose number of bytes (8 each) is in
+    files of single precision alone, and a leaf's mask. Our reader would agree with our writer; Blender did not."""
+    grid = SparseGrid("density", np.array([[3, 4, 5]]), np.array([0.5]))
+    write_grids(tmp_path / "a.vdb", [grid], half)
+    data = (tmp_path / "a.vdb").read_bytes()
+    kind = b"Tree_float_5_4_3" + (b"_HalfFloat" if half else b"")
+    start, block, end = struct.unpack_from("<3q", data, data.index(kind) + len(kind) + 4)
+    topology = data.index(b"ScaleTranslateMap", start) + 17 + 18 * 8
+    root, nodes = 4 + 4 + 4 + 4 + 12, (2 * 4096 + 1) + (2 * 512 + 1)
+    assert block - topology == root + nodes + sizes + 64
+    assert end == len(data) and end - block == 64 + 1 + 8 + (2 if half else 4)
+
+
 def test_grids_that_no_file_holds(tmp_path):
     place = np.zeros((2, 3), int)
     for coords, values, message in (
