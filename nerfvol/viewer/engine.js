@@ -101,8 +101,8 @@ class Engine {
     }
     if (!parts.includes("values")) return;
     this.channels(1 + 3 * (d.sh_degree + 1) ** 2, d.n_vertices, file, (index, low, high) =>
-      this.wasm.octree_channel(index, low, high, codec.differences[index], index ? codec.sh_step : codec.density_step,
-        codec.density_softness));
+      this.wasm.octree_channel(index, low, high, codec.differences[index]));
+    this.wasm.octree_rows(codec.density_step, codec.density_softness, codec.sh_step);
     this.lacks.delete("values");
     if (parts.includes("nodes")) this.makeNodes();
   }

@@ -55,39 +55,44 @@ int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int m
         return ((h >> 20) * 64 + (key & 63)) & uint64_t(capacity - 1);
     };
     int32_t of_siblings[27];  // vertices of the lattice that siblings share: they follow each other, and one look-up does for all
-    for (int64_t leaf = 0; leaf < n; ++leaf) {
-        const int shift = max_level - level[leaf];
-        const int32_t* const at = ijk + 3 * leaf;
-        const bool sibling = leaf && level[leaf] == level[leaf - 1] && !((at[0] ^ at[-3]) >> 1 | (at[1] ^ at[-2]) >> 1 | (at[2] ^ at[-1]) >> 1);
-        if (!sibling) std::fill_n(of_siblings, 27, -1);
-        const int octant = (at[0] & 1) << 2 | (at[1] & 1) << 1 | (at[2] & 1);
-        for (int o = 0; o < 8; ++o) {
-            int32_t& known = of_siblings[lattice_place(octant, o)];
-            if (known >= 0) {
-                ids[8 * leaf + o] = known;
-                continue;
-            }
-            if (2 * int64_t(keys.size()) >= capacity) {
-                capacity *= 2;
-                table.assign(std::size_t(capacity), -1);
-                for (std::size_t v = 0; v < keys.size(); ++v) {
-                    uint64_t s = slot_of(keys[v]);
-                    while (table[s] >= 0) s = (s + 1) & uint64_t(capacity - 1);
-                    table[s] = int32_t(v);
+    // In calls of some leaves: WebAssembly's engines put faster code in place only from one call to the next.
+    const auto number = [&](int64_t from, int64_t to) __attribute__((noinline)) {
+        for (int64_t leaf = from; leaf < to; ++leaf) {
+            const int shift = max_level - level[leaf];
+            const int32_t* const at = ijk + 3 * leaf;
+            const bool sibling = leaf && level[leaf] == level[leaf - 1] && !((at[0] ^ at[-3]) >> 1 | (at[1] ^ at[-2]) >> 1 | (at[2] ^ at[-1]) >> 1);
+            if (!sibling) std::fill_n(of_siblings, 27, -1);
+            const int octant = (at[0] & 1) << 2 | (at[1] & 1) << 1 | (at[2] & 1);
+            for (int o = 0; o < 8; ++o) {
+                int32_t& known = of_siblings[lattice_place(octant, o)];
+                if (known >= 0) {
+                    ids[8 * leaf + o] = known;
+                    continue;
                 }
+                if (2 * int64_t(keys.size()) >= capacity) {
+                    capacity *= 2;
+                    table.assign(std::size_t(capacity), -1);
+                    for (std::size_t v = 0; v < keys.size(); ++v) {
+                        uint64_t s = slot_of(keys[v]);
+                        while (table[s] >= 0) s = (s + 1) & uint64_t(capacity - 1);
+                        table[s] = int32_t(v);
+                    }
+                }
+                uint64_t p[3];
+                for (int axis = 0; axis < 3; ++axis) p[axis] = uint64_t(ijk[3 * leaf + axis] + (o >> (2 - axis) & 1)) << shift;
+                const uint64_t key = spread(p[0]) << 2 | spread(p[1]) << 1 | spread(p[2]);
+                uint64_t s = slot_of(key);
+                while (table[s] >= 0 && keys[std::size_t(table[s])] != key) s = (s + 1) & uint64_t(capacity - 1);
+                if (table[s] < 0) {
+                    table[s] = int32_t(keys.size());
+                    keys.push_back(key);
+                }
+                known = ids[8 * leaf + o] = table[s];
             }
-            uint64_t p[3];
-            for (int axis = 0; axis < 3; ++axis) p[axis] = uint64_t(ijk[3 * leaf + axis] + (o >> (2 - axis) & 1)) << shift;
-            const uint64_t key = spread(p[0]) << 2 | spread(p[1]) << 1 | spread(p[2]);
-            uint64_t s = slot_of(key);
-            while (table[s] >= 0 && keys[std::size_t(table[s])] != key) s = (s + 1) & uint64_t(capacity - 1);
-            if (table[s] < 0) {
-                table[s] = int32_t(keys.size());
-                keys.push_back(key);
-            }
-            known = ids[8 * leaf + o] = table[s];
         }
-    }
+    };
+    constexpr int64_t kFew = 4096;
+    for (int64_t leaf = 0; leaf < n; leaf += kFew) number(leaf, std::min(n, leaf + kFew));
     return int64_t(keys.size());
 }
 

@@ -44,6 +44,7 @@ std::vector<int32_t> codes;
 // ------------------------------------------------------------------ the octree
 struct {
     std::vector<int32_t> first_node, first_leaf, corners;
+    std::vector<int16_t> codes;            // of the channels, one after the other
     Prefiltered nodes;
     float* values = nullptr;
     Tree tree{};
@@ -94,6 +95,26 @@ int number_leaves(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n)
 
 // Where coefficient k of channel c lies in a vertex row: nerfvol/octree/rows.py.
 int slot(int degree, int k, int c) { return degree == 2 && k == 8 ? 28 + c : 16 * (k / 4) + 4 * c + k % 4; }
+
+// In calls of some rows, as number_corners.
+__attribute__((noinline)) void fill_rows(int64_t from, int64_t to, float density_step, float softness, float sh_step) {
+    const Tree& t = octree.tree;
+    const int64_t row = 16 * t.blocks, n = t.n_vertices;
+    const int basis = (t.sh_degree + 1) * (t.sh_degree + 1);
+    int slots[16][3];
+    for (int k = 0; k < basis; ++k)
+        for (int c = 0; c < 3; ++c) slots[k][c] = slot(t.sh_degree, k, c);
+    for (int64_t v = from; v < to; ++v) {
+        float* at = octree.values + row * v;
+        const int16_t* code = octree.codes.data() + v;
+        at[kDensity] = softness * std::sinh(std::clamp(float(*code) * density_step, -80.0f, 80.0f));
+        for (int k = 0; k < basis; ++k) {
+            const float grey = float(code[n * (1 + k)]) * sh_step, red_blue = float(code[n * (1 + basis + k)]) * sh_step;
+            const float green = float(code[n * (1 + 2 * basis + k)]) * sh_step;
+            for (int c = 0; c < 3; ++c) at[slots[k][c]] = kFromGrey[0][c] * grey + kFromGrey[1][c] * red_blue + kFromGrey[2][c] * green;
+        }
+    }
+}
 
 // Unit directions of a square's pixels, as View has them; beyond the picture the last row and column are repeated.
 void square_directions(int64_t row, int64_t column, float* out) {
@@ -216,22 +237,19 @@ int octree_open(const uint8_t* node_mask, const uint8_t* leaf_mask, int32_t n_no
 
 // Channel 0 is density, 1 + axis * K + k a colour; the planes hold one byte a vertex.
 NERFVOL_WEB(octree_channel)
-void octree_channel(int channel, const uint8_t* low, const uint8_t* high, int differences, float step, float softness) {
-    const Tree& t = octree.tree;
-    const int64_t row = 16 * t.blocks;
-    unpack_codes(low, high, t.n_vertices, differences != 0, codes.data());
-    if (channel == 0) {
-        for (int64_t v = 0; v < t.n_vertices; ++v)
-            octree.values[row * v + kDensity] = softness * std::sinh(std::clamp(float(codes[size_t(v)]) * step, -80.0f, 80.0f));
-        return;
-    }
-    const int basis = (t.sh_degree + 1) * (t.sh_degree + 1), axis = (channel - 1) / basis, k = (channel - 1) % basis;
-    for (int c = 0; c < 3; ++c) {
-        float* at = octree.values + slot(t.sh_degree, k, c);
-        const float factor = kFromGrey[axis][c];
-        if (factor == 0) continue;
-        for (int64_t v = 0; v < t.n_vertices; ++v) at[row * v] += float(codes[size_t(v)]) * step * factor;
-    }
+void octree_channel(int channel, const uint8_t* low, const uint8_t* high, int differences) {
+    const int64_t n = octree.tree.n_vertices;
+    unpack_codes(low, high, n, differences != 0, codes.data());
+    octree.codes.resize(size_t(channel + 1) * size_t(n));
+    std::copy_n(codes.data(), n, octree.codes.data() + channel * n);
+}
+
+// The vertices' rows from the channels, a row at a time: each is a cache line or some.
+NERFVOL_WEB(octree_rows) void octree_rows(float density_step, float softness, float sh_step) {
+    constexpr int64_t kFew = 4096;
+    for (int64_t v = 0; v < octree.tree.n_vertices; v += kFew)
+        fill_rows(v, std::min(v + kFew, octree.tree.n_vertices), density_step, softness, sh_step);
+    octree.codes = {};
 }
 
 // What takes long can be made by one instance and taken by others: corners here, values by octree_channel, nodes at last.
