@@ -62,7 +62,9 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     p.add_argument("--light", metavar="NAME,...", help=f"lights instead of the scene's own: {lights}")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a parameter of the scene")
     p.add_argument(
-        "--volume", metavar="FILE", help="a density volume (.vdb, .vdb:GRID, .npz, .raw) for scenes that take one"
+        "--volume",
+        metavar="FILE",
+        help="a density volume (.vdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
     )
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
     return p

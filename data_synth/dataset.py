@@ -60,6 +60,8 @@ class Renderable(Protocol):
 
     def render(self, camera: Camera, *, seed: int = 0) -> Picture: ...
 
+    def write_truth(self, out_dir: Path) -> None: ...
+
 
 def render_view(scene: Renderable, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
     """One view of any scene: by ``integrator`` if given, else the way the scene prefers."""
@@ -107,8 +109,7 @@ def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Option
             future.result()
     for split, cameras in splits.items():
         _write_json(out_dir / f"transforms_{split}.json", _transforms(scene, split, cameras))
-    if isinstance(scene, Scene):
-        scene.write_truth(out_dir)
+    scene.write_truth(out_dir)
     _write_json(out_dir / "provenance.json", _provenance(scene, options, time.perf_counter() - started))
     return out_dir
 

@@ -9,6 +9,7 @@ several times faster than numba's own parallel loops and does not care which thr
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import os
 import sys
@@ -16,6 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TextIO
 
@@ -29,17 +31,29 @@ OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 jit = numba.njit(**OPTIONS)
 
 
-def _sources_stamp() -> str:
-    """A digest of the package's compiled sources."""
-    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.rglob("*.py")) if path != Path(__file__)]
+@cache
+def _imported(path: Path) -> frozenset[Path]:
+    """The files of this package that a source file imports from."""
+    root, found = Path(__file__).parent, set()
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == root.name:
+            place = root.parent.joinpath(*str(node.module).split("."))
+            found |= {place.with_suffix(".py"), *(place / f"{name.name}.py" for name in node.names)}
+    return frozenset(each for each in found if each.is_file())
+
+
+def _stamp(source: str) -> str:
+    """A digest of the compiled sources that a file depends on."""
+    files, todo = set(), {Path(source)}
+    while todo:
+        files |= todo
+        todo = {each for path in todo for each in _imported(path)} - files
+    texts = [path.read_bytes() for path in sorted(files) if path != Path(__file__)]
     return hashlib.sha256(b"".join(t for t in texts if b"@jit" in t or b"@kernel" in t)).hexdigest()
 
 
-_STAMP = _sources_stamp()
-
-
 def kernel(function: Callable) -> Callable:
-    """Compile an entry point and cache its machine code for as long as no compiled source changes.
+    """Compile an entry point and cache its machine code for as long as no compiled source that it depends on changes.
 
     Numba itself compares only the file the function stands in, and would go on using code into which it has inlined
     a function of another, since edited file.
@@ -47,7 +61,7 @@ def kernel(function: Callable) -> Callable:
     compiled = numba.njit(cache=True, **OPTIONS)(function)
     index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if index is not None and hasattr(index, "_source_stamp"):
-        index._source_stamp = _STAMP
+        index._source_stamp = _stamp(function.__code__.co_filename)
     return compiled
 
 

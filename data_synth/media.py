@@ -70,7 +70,10 @@ def triple(values: Iterable[float]) -> tuple[float, float, float]:
 
 def rgb(value: ArrayLike, name: str, upper: float = math.inf) -> tuple[float, float, float]:
     """A grey number or three numbers as an RGB tuple, finite and in [0, upper]."""
-    a = np.broadcast_to(np.asarray(value, dtype=np.float64), (3,)) if np.ndim(value) < 2 else None
+    try:
+        a = np.broadcast_to(np.asarray(value, dtype=np.float64), (3,)) if np.ndim(value) < 2 else None
+    except (TypeError, ValueError):
+        a = None
     if a is None or not np.isfinite(a).all() or a.min() < 0 or a.max() > upper:
         limit = "finite and not negative" if upper == math.inf else f"in [0, {upper:g}]"
         raise InputError(f"{name}: expected one or three numbers {limit}, got {value}")
@@ -78,7 +81,7 @@ def rgb(value: ArrayLike, name: str, upper: float = math.inf) -> tuple[float, fl
 
 
 def _table(value: ArrayLike, name: str, upper: float = math.inf) -> np.ndarray:
-    rows = np.asarray(value) if np.ndim(value) == 2 else [value]
+    rows = value if isinstance(value, (list, tuple, np.ndarray)) and len(value) and np.ndim(value[0]) == 1 else [value]
     return np.array([rgb(row, name, upper) for row in rows])
 
 

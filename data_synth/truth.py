@@ -72,7 +72,9 @@ def numbers(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     boxes = [(m.lo, m.hi) for m in (scene.medium, *scene.media) if m is not None] or [tuple(scene.aabb)]
     lo, hi = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     cells = np.maximum(np.rint((hi - lo) / (hi - lo).max() * RESOLUTION).astype(int), 1)
-    p = np.stack(np.meshgrid(*[np.linspace(a, b, n + 1) for a, b, n in zip(lo, hi, cells, strict=True)], indexing="ij"), -1)
+    p = np.stack(
+        np.meshgrid(*[np.linspace(a, b, n + 1) for a, b, n in zip(lo, hi, cells, strict=True)], indexing="ij"), -1
+    )
     ambient = stuff.CLEAR if scene.bounded or scene.medium is None else 0
     number, best = np.full(p.shape[:3], ambient, np.int8), np.full(p.shape[:3], -np.inf)
     rows, shapes = scene.boundaries(), surfaces.geometry(scene.shapes).shapes
@@ -89,7 +91,7 @@ def numbers(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _holds(shape: np.ndarray, p: np.ndarray) -> np.ndarray:
     if shape[0] == surfaces.PLANE:
-        return (p - shape[2:5]) @ shape[5:8] < 0
+        return np.asarray((p - shape[2:5]) @ shape[5:8] < 0)
     if shape[0] == surfaces.SPHERE:
         return ((p - shape[2:5]) ** 2).sum(axis=-1) < shape[5] ** 2
     return ((p > shape[2:5]) & (p < shape[5:8])).all(axis=-1)

@@ -1,4 +1,4 @@
-"""Import and export of density volumes: OpenVDB, npz and raw files."""
+"""Import and export of density volumes: OpenVDB, npz, raw files, and what scanners write."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from data_synth import media
+from data_synth import media, medical
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import replacing
 from data_synth.vdb import read_vdb
 from data_synth.vdb_write import write_vdb
 
+KNOWN = ", ".join((".vdb", ".npz", ".npy", ".raw", *medical.SUFFIXES))
+
 
 def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """(samples (nx, ny, nz) float32, voxel size (3,)) of a .vdb, .npz, .npy or .raw file.
+    """(samples (nx, ny, nz) float32, voxel size (3,)) of a .vdb, .npz, .npy, .raw, .mhd, .mha, .nrrd, .nii or .nii.gz file.
 
     vdb: the grid called density, or the first; another one by its name, as in smoke.vdb:flame. npz: the array "density",
     or the first 3D one, with an optional "voxel_size". raw: a name that ends in _NXxNYxNZ_TYPE.raw, such as
@@ -30,7 +32,7 @@ def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     else:
         name = ""
     if not given.is_file():
-        raise InputError(f"{given}: expected a volume file (.vdb, .npz, .npy or .raw), found no such file")
+        raise InputError(f"{given}: expected a volume file ({KNOWN}), found no such file")
     spacing = np.ones(3)
     if given.suffix == ".vdb":
         values, spacing = _read_grid(given, name or None)
@@ -38,8 +40,10 @@ def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
         values, spacing = _read_numpy(given)
     elif given.suffix == ".raw":
         values = _read_raw(given)
+    elif given.name.endswith(medical.SUFFIXES):
+        values, spacing = medical.read(given)
     else:
-        raise InputError(f"{given}: expected a volume that ends in .vdb, .npz, .npy or .raw")
+        raise InputError(f"{given}: expected a volume that ends in {KNOWN}")
     return _checked(given, values, spacing)
 
 

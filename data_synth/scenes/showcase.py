@@ -9,13 +9,14 @@ light with occlusion, a Blinn-Phong highlight and a Fresnel reflection of the sk
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from data_synth import checks
 from data_synth.cameras import Camera, Viewpoints, pixel_ray
-from data_synth.image import Picture
+from data_synth.image import Picture, replacing
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.scenes import showcase_sdf as sdf
 from data_synth.scenes.showcase_sdf import FLOOR
@@ -158,6 +159,14 @@ def radiance(haze, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
+def sample_haze(haze, x, y, z, out):
+    for i in range(x.size):
+        for j in range(y.size):
+            for k in range(z.size):
+                out[i, j, k] = haze_density(haze, x[i], y[j], z[k])
+
+
+@kernel
 def render_rows(haze, camera, out, first, last):
     """Rows first..last of out (H, W, 5), one ray through each pixel's centre."""
     ox, oy, oz = camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3]
@@ -225,3 +234,15 @@ class Showcase:
                 512,
             )
         return Picture(out[..., :3], out[..., 3], out[..., 4], samples=self.smooth**2)
+
+    def write_truth(self, out_dir: Path) -> None:
+        """truth.npz: the extinction of the haze in 1/u at the vertices of a grid from lo to hi, 65 along the longest side."""
+        reach, half = self.haze.radius + 3.0 * self.haze.width, 3.0 * self.haze.width + 0.10
+        lo = np.array([-reach, -reach, self.haze.height - half])
+        hi = np.array([reach, reach, self.haze.height + half])
+        shape = np.rint((hi - lo) / (2 * reach) * 64).astype(int) + 1
+        axes = [np.linspace(a, b, n) for a, b, n in zip(lo, hi, shape, strict=True)]
+        density = np.empty(shape, np.float32)
+        sample_haze(self.haze, *axes, density)
+        with replacing(out_dir / "truth.npz") as temporary:
+            np.savez_compressed(temporary, density=density, lo=lo, hi=hi, allow_pickle=False)

@@ -127,36 +127,74 @@ def explosion(
     )
 
 
-def phantom(density: float = 40.0, resolution: int = 128, volume: str | None = None) -> Scene:
-    """a CT-like head phantom through a transfer function: skin, bone and inner organs; takes --volume stent.npz"""
-    if volume is None:
-        lo, hi = (-0.8, -1.0, -0.8), (0.8, 1.0, 0.8)
-        value = _head(resolution)
-    else:
+TISSUE = np.array(
+    [
+        [0.00, 0.00, 0.80, 0.60, 0.50],
+        [0.10, 0.00, 0.80, 0.60, 0.50],
+        [0.18, 0.03, 0.85, 0.55, 0.42],
+        [0.30, 0.02, 0.75, 0.25, 0.22],
+        [0.45, 0.10, 0.80, 0.30, 0.25],
+        [0.60, 0.30, 0.90, 0.80, 0.60],
+        [0.80, 0.80, 0.96, 0.93, 0.85],
+        [1.00, 1.00, 1.00, 0.98, 0.92],
+    ]
+)
+"""A transfer function: value, opacity relative to the largest, and colour."""
+
+
+def phantom(
+    density: float = 40.0,
+    resolution: int = 128,
+    volume: str | None = None,
+    transfer: str | None = None,
+    mode: str = "lit",
+) -> Scene:
+    """a CT-like head phantom through a transfer function: skin, bone and inner organs; takes --volume stent.npz
+
+    transfer: a text file of lines ``value opacity red green blue`` in the volume's own values, instead of TISSUE over
+    its positive range. mode: lit, or emission, which shows the colours themselves as a CT viewer does.
+    """
+    if mode not in ("lit", "emission"):
+        raise InputError(f"scene phantom: mode expects lit or emission, got {mode}")
+    points, lo, hi = TISSUE, (-0.8, -1.0, -0.8), (0.8, 1.0, 0.8)
+    if transfer is not None:
+        points, value_range = _transfer(transfer)
+        if volume is None:
+            raise InputError("scene phantom: transfer belongs to a --volume, expected one")
+        value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3, values=value_range)
+    elif volume is not None:
         value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3)
-    # tissue value -> opacity and colour: (value, extinction, r, g, b)
-    points = np.array(
-        [
-            [0.00, 0.00, 0.80, 0.60, 0.50],
-            [0.10, 0.00, 0.80, 0.60, 0.50],
-            [0.18, 0.03, 0.85, 0.55, 0.42],
-            [0.30, 0.02, 0.75, 0.25, 0.22],
-            [0.45, 0.10, 0.80, 0.30, 0.25],
-            [0.60, 0.30, 0.90, 0.80, 0.60],
-            [0.80, 0.80, 0.96, 0.93, 0.85],
-            [1.00, 1.00, 1.00, 0.98, 0.92],
-        ]
-    )
+    else:
+        value = _head(resolution)
     opacity = np.interp(value, points[:, 0], points[:, 1]).astype(np.float32)
-    colours = np.stack([np.interp(np.linspace(0, 1, 64), points[:, 0], points[:, c]) for c in (2, 3, 4)], axis=1)
-    medium = media.grid(opacity, lo, hi, density, colours, attribute=value)
+    colours = np.stack([np.interp(np.linspace(0, 1, 256), points[:, 0], points[:, c]) for c in (2, 3, 4)], axis=1)
+    albedo, glow = (colours, 0.0) if mode == "lit" else (0.0, colours)
+    medium = media.grid(opacity, lo, hi, density, albedo, glow, attribute=value)
     return Scene(
         medium=medium,
-        lights=[lights.directional((0.6, -0.8, 0.9), 7.0), lights.environment(0.55)],
+        lights=[lights.directional((0.6, -0.8, 0.9), 7.0), lights.environment(0.55)] if mode == "lit" else [],
         viewpoints=Viewpoints(radius=4.0, elevation=(-20, 60), fov=38),
-        integrators=("deep", "march", "path", "emission"),
+        integrators=("deep", "march", "path", "emission") if mode == "lit" else ("emission", "path"),
         aabb=np.array([lo, hi]),
     )
+
+
+def _transfer(path: str) -> tuple[np.ndarray, tuple[float, float]]:
+    """(points as TISSUE with values scaled to [0, 1], the smallest and largest value) of a file."""
+    try:
+        with open(path, encoding="utf-8") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # an empty file is said to be wrong below
+            points = np.loadtxt(file, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: expected lines of value, opacity, red, green, blue: {error}") from error
+    shape = points.shape[1:] == (5,) and len(points) > 1
+    if not shape or not np.isfinite(points).all() or (np.diff(points[:, 0]) <= 0).any():
+        raise InputError(f"{path}: expected two or more lines of value, opacity, red, green, blue, values ascending")
+    if points[:, 1:].min() < 0 or points[:, 1:].max() > 1:
+        raise InputError(f"{path}: expected opacities and colours in [0, 1]")
+    low, high = points[0, 0], points[-1, 0]
+    points[:, 0] = (points[:, 0] - low) / (high - low)
+    return points, (float(low), float(high))
 
 
 def _head(n: int) -> np.ndarray:
@@ -181,21 +219,21 @@ def _head(n: int) -> np.ndarray:
 
 
 def _imported(
-    volume: str, lo: media.Point, hi: media.Point, up: str = "z"
+    volume: str, lo: media.Point, hi: media.Point, up: str = "z", values: tuple[float, float] | None = None
 ) -> tuple[np.ndarray, media.Point, media.Point]:
-    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows."""
-    values, spacing = read_volume(volume)
+    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows. values: what becomes 0 and 1."""
+    samples, spacing = read_volume(volume)
     if up == "y":  # right-handed: x, y, z -> x, -z, y
-        values, spacing = values[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]
-    low, high = float(values.min()), float(values.max())
-    if high <= 0:
+        samples, spacing = samples[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]
+    low, high = values or (0.0, float(samples.max()))
+    if high <= low:
         raise InputError(f"{volume}: expected a density that is somewhere positive, got at most {high:g}")
-    if low < 0:
-        share = float((values < 0).mean())
+    if values is None and samples.min() < 0:
+        share = float((samples < 0).mean())
         warnings.warn(f"{volume}: {share:.1%} of the samples are negative and count as 0", RenderWarning, stacklevel=3)
-    values = np.clip(values / high, 0.0, 1.0)
-    extent = (np.array(values.shape) - 1) * spacing
+    samples = np.clip((samples - low) / (high - low), 0.0, 1.0)
+    extent = (np.array(samples.shape) - 1) * spacing
     room = np.array(hi) - np.array(lo)
     extent *= (room / extent).min()
     middle = 0.5 * (np.array(hi) + np.array(lo))
-    return np.ascontiguousarray(values, np.float32), tuple(middle - extent / 2), tuple(middle + extent / 2)
+    return np.ascontiguousarray(samples, np.float32), tuple(middle - extent / 2), tuple(middle + extent / 2)

@@ -113,16 +113,18 @@ def test_lamps_shine_with_the_cosine_and_not_backwards(point, normal):
 
 
 def test_lamps_throw_shadows():
-    """A lamp with a black back keeps the sun from the floor and from the medium; a clear one does not from behind."""
+    """A lamp keeps the sun from what looks into its face, and with a black back from what looks at that as well."""
 
-    def scene(back):
+    def scene(shines, back):
+        edges = [(0, 40, 0), (40, 0, 0)] if shines == "down" else [(40, 0, 0), (0, 40, 0)]
         return Scene(
             medium=media.grid(np.ones((9, 9, 9)), (-1, -1, -0.9), (1, 1, 0.9), (0.3, 0.5, 0.8), (0.9, 0.6, 0.3)),
             shapes=[surfaces.plane(0, (0, 0, -1), (0, 0, 1))], materials=[materials.lambert(0.5)],
-            lights=[lights.directional((0, 0, 1), 2.0), lights.quad((-20, -20, 1.5), (0, 40, 0), (40, 0, 0), 0.0, back)],
+            lights=[lights.directional((0, 0, 1), 2.0), lights.quad((-20, -20, 1.5), *edges, 0.0, back)],
         )  # fmt: skip
 
     c = camera((0.1, -3.0, 0.2), (0, -1.0, -1.0))
     for integrator in (March(beams=1), Path(spp=50), DeepShadow(beams=1), DeepShadow(beams=1, resolution=6)):
-        assert integrator.render(scene("black"), c).rgb.max() == 0.0
-        assert integrator.render(scene("clear"), c).rgb.min() > 1e-3
+        for shines, back in (("down", "black"), ("down", "clear"), ("up", "black")):
+            assert integrator.render(scene(shines, back), c).rgb.max() == 0.0
+        assert integrator.render(scene("up", "clear"), c).rgb.min() > 1e-3

@@ -7,6 +7,7 @@ import pytest
 
 from data_synth import media, scene_file, scenes
 from data_synth.scene import Scene
+from data_synth.scenes.showcase import Showcase
 
 
 def written(scene, tmp_path):
@@ -39,9 +40,20 @@ def test_every_scene_has_its_truth(name, tmp_path):
             assert np.array_equal(truth["medium0_density"], media.dense(m))
 
 
+def test_the_showcase_writes_its_haze(tmp_path):
+    scene = Showcase(haze=3.0)
+    truth = written(scene, tmp_path)
+    x, y, z = (np.linspace(a, b, n) for a, b, n in zip(truth["lo"], truth["hi"], truth["density"].shape, strict=True))
+    i, j, k = (int(np.argmin(abs(axis - at))) for axis, at in ((x, 0.62), (y, 0.0), (z, 0.28)))
+    q = ((x[i] ** 2 + y[j] ** 2) ** 0.5 - 0.62) ** 2 + (z[k] - 0.28 - 0.2 * x[i] * y[j] / (x[i] ** 2 + y[j] ** 2)) ** 2
+    ripple = 1 + 0.6 * np.sin(9 * x[i] + 3 * z[k]) * np.sin(8 * y[j] - 4 * z[k])
+    want = 3.0 * ripple * (np.exp(-q / 0.13**2) - np.exp(-9.0))
+    assert truth["density"][i, j, k] == pytest.approx(want, rel=1e-6) and truth["density"].max() < 3.0 * 1.6
+
+
 def test_attributes_are_written_at_their_samples(tmp_path):
     a = np.random.default_rng(0).random((10, 11, 12)).astype(np.float32)
-    scene = Scene(medium=media.grid(np.ones_like(a), (0, 0, 0), (1, 1, 1), attribute=a, Le=[0.0, 1.0]))
+    scene = Scene(medium=media.grid(np.ones_like(a), (0, 0, 0), (1, 1, 1), attribute=a, Le=[[0.0] * 3, [1.0] * 3]))
     assert np.array_equal(written(scene, tmp_path)["medium0_attribute"], a)
 
 
