@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
-from nerfvol.files.numpyfile import read_npz
 from nerfvol.files import pictures
+from nerfvol.files.numpyfile import read_npz
 from nerfvol.kernels import ops
 from nerfvol.octree.points import octree_density
 from nerfvol.octree.topology import MAX_LEVEL

@@ -16,6 +16,7 @@ from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs, estimate_bytes
 from nerfvol.datasets.tiles import foreground_share
+from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
@@ -235,7 +236,7 @@ class OctreePlan:
     def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int) -> None:
         """Raises InputError where not even a coarse octree fits in the memory at hand."""
         self._dataset, lens = dataset, dataset.cameras[0].intrinsics
-        share = foreground_share(dataset, config.background)
+        share = foreground_share(dataset, config.background or WHITE)
         pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
         self.foreground_tiles = max(share, 0.01) * pixels / TILE_RAYS
         self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp")
