@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 from nerfvol.files.arrayfile import ArrayFile
 from nerfvol.files.page import model_file
 from nerfvol.files.run_folder import model_path
@@ -80,9 +80,10 @@ def load_model(target: str | os.PathLike[str]) -> Model:
     with model_file(model_path(target)) as path:
         opener = SUFFIXES.get(path.suffix.lower())
         if opener is None:
-            stated = str(describe_file(path).get("format"))
+            stated = describe_file(path).get("format")
+            stated = stated if isinstance(stated, str) else shown(stated)
             if stated not in FORMATS:
-                raise InputError(f"{path}: its format is {stated!r}, expected one of {', '.join(FORMATS)}")
+                raise InputError(f"{path}: its format is {shown(stated)}, expected one of {', '.join(FORMATS)}")
             opener = FORMATS[stated]
         module, _, name = opener.partition(":")
         return cast(Model, operator.attrgetter(name)(importlib.import_module(module))(path))

@@ -2,9 +2,9 @@
 
     python tools/fuzz.py [--seconds 60] [--seed 0] [--keep DIR]      (make fuzz)
 
-Documents are changed value by value (another type, huge, negative, empty, nested, gone), binary files byte by byte and cut. What
-readers raise besides InputError is a find, and so is what takes longer than ten seconds or 6 GB: it is printed with the seed and
-the number that make it again, and its file is kept in --keep. The exit code is 1 where there are finds.
+Documents are changed value by value (another type, huge, negative, empty, nested, gone), binary files byte by byte and cut.
+What readers raise besides InputError is a find, and so is what takes longer than ten seconds or 6 GB: it is printed with the
+seed and the number that make it again, and its file is kept in --keep. The exit code is 1 where there are finds.
 """
 
 from __future__ import annotations
@@ -137,7 +137,11 @@ def of_json(path: Path) -> Callable[[random.Random], None]:
 
 def of_bytes(path: Path) -> Callable[[random.Random], None]:
     whole = path.read_bytes()
-    return lambda rng: path.write_bytes(broken(whole, rng)) and None
+
+    def change(rng: random.Random) -> None:
+        path.write_bytes(broken(whole, rng))
+
+    return change
 
 
 def of_header(path: Path) -> Callable[[random.Random], None]:
@@ -182,9 +186,8 @@ def targets(folder: Path) -> list[tuple[str, Callable[[random.Random], None], Ca
             path = folder / f"octree_{storage}_{len(found)}.safetensors"
             save_octree(path, octree, {"orbit": orbit, "background": [1, 1, 1]}, storage)
             add(f"octree {storage} {how.__name__}", how(path), lambda path=path: draw(path))
-    rng = np.random.default_rng(0)
-    splats = Splats(rng.normal(size=(9, 3)), rng.normal(size=(9, 3)) - 3, rng.normal(size=(9, 4)), rng.normal(size=9),
-                    rng.normal(size=(9, 3, 4)))  # fmt: skip
+    normal = lambda *shape: np.random.default_rng(0).normal(size=shape).astype(np.float32)  # noqa: E731
+    splats = Splats(normal(9, 3), normal(9, 3) - 3, normal(9, 4), normal(9), normal(9, 3, 4))
     for how in (of_header, of_bytes):
         path = folder / f"splats_{len(found)}.safetensors"
         save_splats(path, splats, {"near": 0.01, "orbit": orbit})
@@ -210,7 +213,7 @@ def targets(folder: Path) -> list[tuple[str, Callable[[random.Random], None], Ca
     plain = {"seed": 3, "time_budget": "5m", "background": [1, 0, 0], "octree": {"steps": 5, "sh_degree": 1}}
     values: list[Any] = [plain]
     add("setting's values", lambda rng: values.__setitem__(0, damaged(plain, rng)),
-        lambda: assemble(Config, (values[0] if isinstance(values[0], dict) else {}, "a.yaml"), say=lambda sentence: None))  # fmt: skip
+        lambda: assemble(Config, (values[0] if isinstance(values[0], dict) else {}, "a.yaml"), say=len))  # fmt: skip
     return found
 
 
@@ -250,8 +253,11 @@ def main() -> int:
                     read()
             except InputError as error:
                 refused += 1
-                if "\n" in str(error) or len(str(error)) > 1000:
-                    finds.setdefault(f"{name}: a sentence of {len(str(error))} characters", f"{given.seed} {count}")
+                if ("\n" in str(error) or len(str(error)) > 1000) and (
+                    text := f"{name}: no short sentence"
+                ) not in finds:
+                    finds[text] = f"{given.seed} {count}"
+                    print(f"{text}: {str(error)[:300]!r}   (seed and number {finds[text]})", flush=True)
             except (Exception, TooLong) as error:  # a find
                 where = traceback.extract_tb(error.__traceback__)[-1]
                 text = (

@@ -67,7 +67,7 @@ def _agreeing(across: NDArray[np.float64], origins: NDArray[np.float64]) -> NDAr
     if len(origins) < 5 or float(np.linalg.eigvalsh(across.mean(axis=0))[0]) < _LEAST_CERTAINTY:
         return everything
     weight = np.ones(len(origins))
-    distance = weight
+    distance, point = weight, np.zeros(3)
     for _ in range(_ROUNDS):
         matrix = (across * weight[:, None, None]).sum(axis=0)
         right = ((across @ origins[:, :, None])[:, :, 0] * weight[:, None]).sum(axis=0)

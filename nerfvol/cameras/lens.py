@@ -77,7 +77,7 @@ class Lens(ABC):
         """Unit directions (n, 3) as of :meth:`undistort`, and where there is one, (n,) bool; elsewhere along the axis."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what overflows does not converge
             directions = self._undistort(plane)
-        found = np.isfinite(directions).all(axis=1)
+        found: NDArray[np.bool_] = np.isfinite(directions).all(axis=1)
         return np.where(found[:, None], directions, (0.0, 0.0, 1.0)), found
 
     @abstractmethod
@@ -144,7 +144,7 @@ class BrownConrady(Lens):
         d = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
         return d / np.sqrt((d * d).sum(axis=1, keepdims=True))
 
-    def _solve(self, plane: Float) -> tuple[Float, NDArray[np.bool_]]:
+    def _solve(self, plane: Float) -> Float:
         """Undistorted positions (n, 2), on the branch that contains the axis: a step off it is pulled back inwards."""
         x, y = plane[:, 0].copy(), plane[:, 1].copy()
         p1, p2, fold = self.p1, self.p2, self._fold

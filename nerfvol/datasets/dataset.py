@@ -37,7 +37,8 @@ class Dataset:
     ``threads``: that decode and average; one for every core by default. ``read_points``: see :attr:`points`.
     ``masks``: uint8 (h, w) a view, 255 where its pixels count, 0 where they are not to be looked at, between where averaging
     mixed both; None for a view that counts whole, and for all of them.
-    ``backdrop``: the RGB in [0, 1] that opaque pictures of an object have behind it. ``kind``: one of kinds.KINDS. ``frame``: the frame that cameras, bounds and points are in; None: scene units.
+    ``backdrop``: the RGB in [0, 1] that opaque pictures of an object have behind it. ``kind``: one of kinds.KINDS.
+    ``frame``: the frame that cameras, bounds and points are in; None: scene units.
 
     dataclasses.replace makes a dataset of other cameras, images, bounds; what is not replaced is shared, the store of images
     too.

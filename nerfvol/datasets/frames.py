@@ -214,8 +214,8 @@ def _tell(
     turned = [view.frame.listed for view in views if view.orientation != 1]
     if turned:
         messages.append(
-            f"{len(turned)} of {len(views)} photographs lie on their side in their files and are turned as their EXIF orientation "
-            "says, since the calibration is for upright ones"
+            f"{len(turned)} of {len(views)} photographs lie on their side in their files and are turned as their EXIF "
+            "orientation says, since the calibration is for upright ones"
         )
     scaled: Counter[tuple[tuple[int, int], tuple[int, int], bool]] = Counter()
     off = []
@@ -237,12 +237,12 @@ def _tell(
         )
     if off:
         messages.append(
-            f"the principal point (cx, cy) of {len(off)} images lies more than a quarter of the picture from its middle: is the "
-            f"calibration for pictures of another size? ({named(off)})"
+            f"the principal point (cx, cy) of {len(off)} images lies more than a quarter of the picture from its middle: is "
+            f"the calibration for pictures of another size? ({named(off)})"
         )
     reached = [reach.mean() for v in views if (reach := v.camera.intrinsics.seen()) is not None]
     if reached:
         messages.append(
-            f"the lens reaches {100 * float(np.mean(reached)):.0f} % of {len(reached)} images: what lies beyond has no ray, and "
-            "takes no part in training and scores"
+            f"the lens reaches {100 * float(np.mean(reached)):.0f} % of {len(reached)} images: what lies beyond has no ray, "
+            "and takes no part in training and scores"
         )

@@ -105,7 +105,8 @@ class ImageHeader:
     @property
     def upright(self) -> tuple[int, int]:
         """(width, height) once the picture is turned as its EXIF orientation says."""
-        return self.size[::-1] if self.orientation >= 5 else self.size
+        width, height = self.size
+        return (height, width) if self.orientation >= 5 else (width, height)
 
 
 def image_header(path: Path) -> ImageHeader:

@@ -146,9 +146,8 @@ class MaskFinder:
         """``folder``: of the data set; ``images``: of the photographs, where masks folders may lie too."""
         self._finder = ImageFinder(folder)
         self._beside: dict[Path, ImageFinder] = {}
-        self._folders = [place for place in {folder / "masks", (images or folder) / "masks", (images or folder).parent / "masks"}
-                         if place.is_dir()]  # fmt: skip
-        self._images = images
+        homes = [folder] if images is None or images == folder else [folder, images, images.parent]
+        self._folders = [place for place in dict.fromkeys(home / "masks" for home in homes) if place.is_dir()]
         self.stated = 0
         self.missing: list[str] = []
 
@@ -189,7 +188,8 @@ class MaskFinder:
         said = []
         if with_mask:
             said.append(
-                f"{len(with_mask)} of {len(frames)} images have masks: what those leave out takes no part in training and scores"
+                f"{len(with_mask)} of {len(frames)} images have masks: what those leave out takes no part in training "
+                "and scores"
             )
         if self.missing:
             said.append(

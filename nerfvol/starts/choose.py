@@ -34,8 +34,8 @@ class Start:
 def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = None, seed: int = 0) -> Start:
     """The points that splats of this dataset begin from.
 
-    Objects before nothing or a plain backdrop begin from random points in their box; photographs from the points of their COLMAP
-    model, else from a plane sweep; a model of fewer than 4,000 points gets the sweep's as well. Where a sweep finds
+    Objects before nothing or a plain backdrop begin from random points in their box; photographs from the points of their
+    COLMAP model, else from a plane sweep; a model of fewer than 4,000 points gets the sweep's as well. Where a sweep finds
     nothing, what there is of a model, or random points, are used. ``name``: "points", "sweep", "points+sweep" or "random".
 
     Raises:

@@ -191,8 +191,8 @@ def require_same(saved: Mapping[str, Any] | None, data: Data, checkpoint: Path) 
         raise InputError(f"{checkpoint} is damaged: its record of the pictures cannot be read ({error})") from error
     if different is not None:
         raise InputError(
-            f"--resume: the pictures are not those that the run was begun with: {different}; put them back, or train again from "
-            "the start"
+            f"--resume: the pictures are not those that the run was begun with: {different}; put them back, or train again "
+            "from the start"
         )
 
 

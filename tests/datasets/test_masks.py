@@ -152,6 +152,18 @@ def test_pixels_beyond_a_lenss_reach_have_no_ray():
     assert Intrinsics(64, 64, 80.0, 80.0, 32.0, 32.0, Fisheye(k1=-0.15)).seen() is None
 
 
+def test_the_second_branch_of_a_lens_is_no_picture():
+    """theta (1 - 0.3 theta^2 + 0.04 theta^4) turns back at 1.25, and rises again from 1.79 on, to radii that it had before:
+    what lies beyond the first maximum has no ray, though the polynomial has a root there."""
+    lens = Fisheye(k1=-0.3, k2=0.04)
+    turns = float(np.sqrt((0.9 - np.sqrt(0.81 - 0.8)) / 0.4))
+    most = turns * (1 - 0.3 * turns**2 + 0.04 * turns**4)
+    radii = np.array([0.5 * most, 0.999 * most, 1.001 * most, 1.5 * most, 3 * most])
+    directions, found = lens.undistort_where(np.stack([radii, 0 * radii], axis=1))
+    np.testing.assert_array_equal(found, [True, True, False, False, False])
+    assert (np.arctan2(directions[:2, 0], directions[:2, 2]) <= turns).all()
+
+
 def fisheye(folder, images, k1=-0.15, focal=20.0):
     folder.mkdir(exist_ok=True)
     names = scenes.save_images(folder, images)

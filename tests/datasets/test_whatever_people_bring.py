@@ -326,8 +326,8 @@ def test_text_saved_on_windows_is_text(tmp_path, encoding):
 
 
 @pytest.mark.parametrize("listed", [
-    "./images/view_{:03d}.png", "images\\view_{:03d}", "/home/me/photos/images/view_{:03d}.png", "C:\\photos\\images\\view_{:03d}.PNG",
-    "../shoot/images/view_{:03d}.png",
+    "./images/view_{:03d}.png", "images\\view_{:03d}", "/home/me/photos/images/view_{:03d}.png",
+    "C:\\photos\\images\\view_{:03d}.PNG", "../shoot/images/view_{:03d}.png",
 ])  # fmt: skip
 def test_paths_of_other_machines_find_their_pictures(tmp_path, listed):
     def rename(document):

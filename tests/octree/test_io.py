@@ -393,7 +393,8 @@ def test_fuzzed_masks(tmp_path, masks, n):
 
 
 @pytest.mark.parametrize("key, value", [
-    ("size", 10**400), ("origin", [0, 0, 10**400]), ("aabb", "big"), ("nerfvol", 5), ("n_vertices", True), ("density_scale", "9"),
+    ("size", 10**400), ("origin", [0, 0, 10**400]), ("aabb", "big"), ("nerfvol", 5), ("n_vertices", True),
+    ("density_scale", "9"),
 ])  # fmt: skip
 def test_headers_that_lie_are_one_sentence(tmp_path, key, value):
     octree = Octree.from_leaves([1] * 8, np.argwhere(np.ones((2, 2, 2))), [0] * 3, 1.0)
