@@ -80,8 +80,9 @@ def octree_around(
     """
     size = scene.side * 2.0**scene.n_shells
     origin = scene.center - size / 2
-    inside = ((splats.means + splats.origin > origin) & (splats.means + splats.origin < origin + size)).all(1)
-    if not inside.any():
+    means = splats.means + splats.origin
+    inside = np.flatnonzero(((means > origin) & (means < origin + size)).all(1))
+    if not len(inside):
         raise InputError(
             f"none of the {splats.n} splats lies in the region of the octree, {origin} and {size:.4g} beyond"
         )
