@@ -81,8 +81,9 @@ def octree_around(
     """
     size = scene.side * 2.0**scene.n_shells
     origin = scene.center - size / 2
-    inside = ((splats.means + splats.origin > origin) & (splats.means + splats.origin < origin + size)).all(1)
-    if not inside.any():
+    means = splats.means + splats.origin
+    inside = np.flatnonzero(((means > origin) & (means < origin + size)).all(1))
+    if not len(inside):
         raise InputError(
             f"none of the {splats.n} splats lies in the region of the octree, {origin} and {size:.4g} beyond"
         )
@@ -144,18 +145,24 @@ def _filled(
 def _resolved(level: NDArray[np.int64], codes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Leaves (levels, positions) that cover the same cells, each once: a cell that holds finer ones is split."""
     coarsest, finest = int(level.min()), int(level.max())
-    own = {k: np.unique(codes[level == k]) for k in range(coarsest, finest + 1)}
+    own = {k: _distinct(codes[level == k]) for k in range(coarsest, finest + 1)}
     above = {finest: np.empty(0, np.int64)}
     for k in range(finest - 1, coarsest - 1, -1):
-        above[k] = np.unique(np.concatenate([own[k + 1], above[k + 1]]) >> 3)
+        above[k] = _distinct(np.concatenate([own[k + 1], above[k + 1]]) >> 3)
     levels, leaves, pushed = [], [], np.empty(0, np.int64)
     for k in range(coarsest, finest + 1):
-        cells = np.unique(np.concatenate([own[k], pushed]))
+        cells = _distinct(np.concatenate([own[k], pushed]))
         split = np.isin(cells, above[k], assume_unique=True)
         leaves.append(cells[~split])
         levels.append(np.full(len(leaves[-1]), k))
         pushed = (cells[split][:, None] * 8 + np.arange(8)).reshape(-1)
     return np.concatenate(levels), demorton(np.concatenate(leaves))
+
+
+def _distinct(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The different ones of (n,) codes, rising; sorted, which is several times as fast as numpy's unique."""
+    codes = np.sort(codes)
+    return codes[np.concatenate([[True], codes[1:] != codes[:-1]])] if len(codes) else codes
 
 
 def _write(

@@ -122,16 +122,19 @@ def _merged(leaves: dict[int, _Cells], tolerance: float, agreement: float, large
     """Discs' cells by level: where a cell's children agree, the cell."""
     finest, done = max(leaves), {}
     none = _Cells(*(column[:0] for column in vars(leaves[finest]).values()))
-    cells = none
+    cells, apart = none, none.code  # of which something is a disc of its own, at the level at hand
     for level in range(finest, 0, -1):
         cells = _Cells.joined(leaves.get(level, none), cells)
         if not len(cells.code):
+            apart = apart >> 3
             continue
         parents, number = cells.parents()
         dc = parents.rows.reshape(len(parents.code), 3, -1)[:, :, 0] * Y00
         deviation = np.sqrt(np.maximum(parents.square - dc**2, 0).max(1))
         one = (deviation < tolerance) & (np.linalg.norm(parents.normal, axis=1) > agreement)
         one &= level > finest - largest
+        one &= ~np.isin(parents.code, apart >> 3)  # half a cell would be a disc twice its size
+        apart = np.concatenate([apart >> 3, parents.code[~one]])
         if not one[number].all():
             done[level] = cells[~one[number]]
         cells = parents[one]

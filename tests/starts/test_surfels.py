@@ -49,6 +49,7 @@ def test_colours_that_differ_stay_apart():
     octree.sh = sh
     splats = surfels(octree, np.ones(octree.n_leaves))
     assert 4 < splats.n < 256 and len(np.unique(splats.log_scales[:, 0].round(4))) > 1
+    np.testing.assert_allclose(splats.logits, splats.logits[0], rtol=1e-4)  # discs of every size are as opaque
     few = surfels(octree, np.ones(octree.n_leaves), most=10)
     assert few.n <= 10
 
