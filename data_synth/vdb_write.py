@@ -138,7 +138,7 @@ class _Layout:
 
     @property
     def _nothing(self) -> bytes:
-        """No values at all, as a node without tiles has them: OpenVDB reads and writes how many bytes they take, 0, save in half
+        """No values at all, as a node without tiles has them: OpenVDB reads and writes the bytes they take, 0, save in half
         precision, where it returns before."""
         return b"" if self.half else struct.pack("<q", 0)
 

@@ -127,7 +127,7 @@ def render(bpy: Any, path: Path, picture: Path, side: int, samples: int) -> None
     else:
         bpy.ops.import_scene.gltf(filepath=str(path))
         item = next(o for o in scene.objects if o.type == "MESH")
-    import mathutils
+    mathutils = importlib.import_module("mathutils")  # Blender's own
 
     corners = corners_of(bpy, item)
     middle, reach = corners.mean(axis=0), float(np.linalg.norm(np.ptp(corners, axis=0))) / 2

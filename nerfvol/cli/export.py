@@ -93,8 +93,9 @@ def run(options: ExportOptions) -> int:
     given |= {"full_float": options.full_float or None, "srgb": options.srgb or None}
     if options.cameras not in (None, "sphere") or "cameras" in row.options and options.cameras is None:
         given["cameras"] = _cameras(target, options.cameras)
-    if given.get("cameras") is not None and "views" in row.options:
-        print(f"the surface is seen from the cameras of {given['cameras'].source}")
+    cameras: Cameras | None = given.get("cameras")
+    if cameras is not None and "views" in row.options:
+        print(f"the surface is seen from the cameras of {cameras.source}")
     level = options.level
     if row.name == "vdb" and level is None and options.max_bytes is None:
         level = 8  # finer ones are large, and programs that march them slow

@@ -49,7 +49,9 @@ def _cropped(model: Model, box: NDArray[np.float64]) -> Model:
         splats = model.splats
         return SplatModel(splats.select(inside(splats.means.astype(np.float64) + splats.origin)), model.metadata)
     assert isinstance(model, PointModel)
-    return PointModel(model.cloud[inside(model.cloud.positions)], model.metadata, model.composite)
+    cropped = PointModel(model.cloud[inside(model.cloud.positions)], model.metadata)
+    cropped.composite = model.composite
+    return cropped
 
 
 def turn_to(model: Model, up: Up) -> NDArray[np.float64]:

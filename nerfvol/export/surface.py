@@ -118,5 +118,11 @@ def _shot(model: Model, camera: Camera) -> Shot:
     directions = camera.rays()[1].reshape(image["normal"].shape)
     normal = image["normal"] / np.maximum(np.linalg.norm(image["normal"], axis=-1, keepdims=True), 1e-6)
     away = (normal * directions).sum(axis=-1, keepdims=True) > 0
-    colour = image["rgb"] / np.maximum(opacity, 1e-3)[..., None]
-    return Shot(camera, depth, opacity, np.clip(colour, 0, 1), np.where(away, -normal, normal).astype(np.float32))
+    colour = np.clip(image["rgb"] / np.maximum(opacity, 1e-3)[..., None], 0, 1).astype(np.float32)
+    return Shot(
+        camera,
+        depth,
+        opacity,
+        np.clip(colour, 0, 1).astype(np.float32),
+        np.where(away, -normal, normal).astype(np.float32),
+    )

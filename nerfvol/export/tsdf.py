@@ -105,7 +105,7 @@ def _average(
             counts = np.where(shown & (apart > -reach), slope[pixel], 0).astype(np.float32)
             total[part] += counts * np.minimum(apart / reach, 1)
             weight[part] += counts
-    return total / np.maximum(weight, 1e-12), weight
+    return (total / np.maximum(weight, 1e-12)).astype(np.float32), weight
 
 
 def _facing(shot: Shot) -> NDArray[np.float32]:
@@ -127,10 +127,10 @@ def _colours(shots: Sequence[Shot], vertices: NDArray[np.float64], tolerance: fl
     known = weight > 0
     colours = total / np.maximum(weight, 1e-12)[:, None]
     if known.any() and not known.all():
-        from scipy.spatial import cKDTree  # scikit-image brings it
+        from scipy.spatial import KDTree  # scikit-image brings it
 
-        colours[~known] = colours[known][cKDTree(vertices[known]).query(vertices[~known])[1]]
-    return colours
+        colours[~known] = colours[known][KDTree(vertices[known]).query(vertices[~known])[1]]
+    return colours.astype(np.float32)
 
 
 def without_islands(
