@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
+import re
 import sys
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -14,9 +17,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from data_synth import integrators, scene_file, scenes
-from data_synth.dataset import Options, Renderable, render_view, write_dataset
+from data_synth.dataset import Each, Files, Options, Renderable, View, render_files, render_view, write_dataset
 from data_synth.errors import InputError, RenderWarning
-from data_synth.image import write_png
+from data_synth.image import encode_png, write_png
 from data_synth.integrators import Integrator
 from data_synth.jit import say_when_compiling
 from data_synth.scene import Scene
@@ -67,10 +70,12 @@ def parser(details: str = "") -> argparse.ArgumentParser:
         help="a density volume (.vdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
     )
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
+    p.add_argument("--frames", metavar="A-B[/S]", help="only these of all views (training, validation, test, from 0), and of "
+                   "these those that are not there yet: many processes can share a folder")  # fmt: skip
     return p
 
 
-def main(argv: list[str]) -> int:
+def main(argv: list[str], each: Each | None = None) -> int:
     """Run ``synth`` with the arguments after the word; the exit code. Bad input is one sentence and code 2."""
     try:
         with warnings.catch_warnings():
@@ -84,7 +89,7 @@ def main(argv: list[str]) -> int:
             if args.scene == "list":
                 return _list(argv)
             with say_when_compiling():
-                return _render(args)
+                return _render(args, each)
     except InputError as error:
         print(f"nerfvol synth: {error}", file=sys.stderr)
         return 2
@@ -184,12 +189,22 @@ def _integrator(args: argparse.Namespace, scene: Renderable) -> Integrator | Non
     return integrators.make(name, **given) if isinstance(scene, Scene) else None
 
 
-def _render(args: argparse.Namespace) -> int:
+def _chosen(text: str | None) -> tuple[int, int, int] | None:
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,9})-(\d{1,9})(?:/(\d{1,9}))?", text.strip(), re.ASCII)
+    first, last, step = (int(part or 1) for part in match.groups()) if match else (0, 0, 0)
+    if last < first or not step:
+        raise InputError(f"--frames: expected A-B or A-B/S with A up to B and S at least 1, got '{text}'")
+    return first, last, step
+
+
+def _render(args: argparse.Namespace, each: Each | None) -> int:
     if bool(args.out) == bool(args.picture):
         got = "both" if args.out else "nothing"
         raise InputError(f"--out, --picture: expected a folder to write or one portrait, got {got}")
     started = time.perf_counter()
-    options = Options(args.views, _size(args.size), args.seed, None, args.exr)
+    options = Options(args.views, _size(args.size), args.seed, None, args.exr, None, _chosen(args.frames), each)
     if args.picture and (Path(args.picture).suffix not in (".jpg", ".png") or not Path(args.picture).parent.is_dir()):
         raise InputError(f"--picture: expected a .jpg or .png in a folder that exists, got {args.picture}")
     scene = _scene(args)
@@ -205,6 +220,31 @@ def _render(args: argparse.Namespace) -> int:
     out = write_dataset(scene, args.out, replace(options, integrator=integrator, progress=progress))
     print(f"{out}: {args.views} training views of {scene.name} in {time.perf_counter() - started:.1f} s")
     return 0
+
+
+def render_task(settings: Mapping[str, Any], files: Mapping[str, Path], view: View) -> Files:
+    """The files of one view of the scene that settings["argv"] describes: for the workers of a cluster."""
+    args, scene, integrator = _opened(tuple(settings["argv"]))
+    return render_files(scene, integrator, args.seed, args.exr, view)
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(argv: tuple[str, ...]) -> tuple[argparse.Namespace, Renderable, Integrator | None]:
+    args = parser().parse_args(argv)
+    scene = _scene(args)
+    return args, scene, _integrator(args, scene)
+
+
+def probe() -> bytes:
+    """What tells machines apart that would render other bytes: small pictures of two scenes by all their integrators."""
+    found = b""
+    for name in ("sphere", "showcase"):
+        scene = scenes.make(name)
+        camera = scene.viewpoints.camera(30.0, 20.0, 8, 6)
+        for integrator in scene.integrators if isinstance(scene, Scene) else ("",):
+            picture = render_view(scene, camera, integrators.make(integrator) if integrator else None, 1)
+            found += picture.rgb.tobytes() + encode_png(picture.rgba8(1.0))
+    return found
 
 
 def _portrait(scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace) -> int:

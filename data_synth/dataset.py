@@ -2,24 +2,44 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import os
 import platform
+import re
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from data_synth.cameras import Camera, Viewpoints
 from data_synth.errors import InputError
-from data_synth.image import Picture, replacing, write_exr, write_png
+from data_synth.image import Picture, encode_exr, encode_png, replacing
 from data_synth.integrators import Integrator
 from data_synth.scene import Scene
+
+
+Files = dict[str, bytes]
+"""The files of a view by the end of their names."""
+
+
+class View(NamedTuple):
+    """One picture of a data set: its number through the splits, its name below the folder, its camera."""
+
+    number: int
+    name: str
+    camera: Camera
+
+
+Each = Callable[[Callable[[View], Files], Sequence[View]], Iterable[Files]]
+PLAN, PROVENANCE = "plan.json", "provenance.json"
+"""What a set is of: while it is not complete, and then."""
+SPLITS = ("train", "val", "test")
 
 
 @dataclass
@@ -30,6 +50,9 @@ class Options:
     size: (width, height) in pixels. exr: also write linear float EXR files with distance, and variance where known.
     integrator: None for the scene's own choice, else an object with ``render(scene, camera, seed)``.
     progress: called with (views done, views in all) after every view.
+    chosen: of all views, counted through the splits, (first, last, step): these alone are rendered, and of these only those
+    that are not there yet; the folder is complete, and says so, once all are, whoever made them. None: all.
+    each: how views are rendered: (function, views) -> their files in order; None: here, one after the other.
     """
 
     views: int = 60
@@ -38,6 +61,8 @@ class Options:
     integrator: Integrator | None = None
     exr: bool = False
     progress: Callable[[int, int], None] | None = None
+    chosen: tuple[int, int, int] | None = None
+    each: Each | None = None
 
     def __post_init__(self) -> None:
         if self.views < 1:
@@ -81,8 +106,9 @@ def split_cameras(scene: Renderable, views: int, size: tuple[int, int], seed: in
 def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Options | None = None) -> Path:
     """Render every split of ``scene`` into ``out_dir`` and return the folder.
 
-    Pictures are 8-bit sRGB PNG with straight alpha. ``transforms_*.json`` are written last, so that a folder that has
-    them is complete; ``provenance.json`` tells how to make the folder again.
+    Pictures are 8-bit sRGB PNG with straight alpha. ``transforms_*.json`` are written last, and an earlier set's go before its
+    pictures do, so that a folder that has them is complete; ``provenance.json`` tells how to make the folder again. A set whose
+    making was stopped goes on.
     """
     options = options or Options()
     out_dir = Path(out_dir)
@@ -92,32 +118,118 @@ def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Option
         raise InputError(f"--out: cannot make the folder {out_dir}: {error.strerror}") from error
     started = time.perf_counter()
     splits = split_cameras(scene, options.views, options.size, options.seed)
-    total, done = sum(map(len, splits.values())), 0
-    with ThreadPoolExecutor(1) as writer:  # compresses a picture while the next one renders
+    views, record = views_of(splits), _provenance(scene, options)
+    wanted = views
+    if options.chosen is not None:
+        first, last, step = options.chosen
+        if last >= len(views):
+            raise InputError(
+                f"--frames {first}-{last}: there are the views 0-{len(views) - 1} (training, validation, test)"
+            )
+        wanted = views[first : last + 1 : step]
+    if not _claim(out_dir, record, shared=options.chosen is not None):
+        return out_dir
+    for split in splits:
+        (out_dir / split).mkdir(exist_ok=True)
+    wanted = [view for view in wanted if not _is_there(out_dir, view, options.exr)]
+    render = functools.partial(render_files, scene, options.integrator, options.seed, options.exr)
+    with ThreadPoolExecutor(1) as writer:  # compresses and writes a picture while the next one renders
+        if options.each is None:
+            made = (
+                writer.submit(
+                    encode, render_numbered(scene, options.integrator, options.seed, view), scene.exposure, options.exr
+                )
+                for view in wanted
+            )
+        else:
+            made = map(_done, options.each(render, wanted))
         written = []
-        for split, cameras in splits.items():
-            (out_dir / split).mkdir(exist_ok=True)
-            for k, camera in enumerate(cameras):
-                view_seed = (options.seed * 1_000_003 + done) & 0x7FFFFFFF
-                picture = render_view(scene, camera, options.integrator, view_seed)
-                stem = out_dir / split / f"r_{k}"
-                written.append(writer.submit(_write_picture, picture, stem, scene.exposure, options.exr))
-                done += 1
-                if options.progress:
-                    options.progress(done, total)
+        for done, (view, files) in enumerate(zip(wanted, made, strict=True), 1):
+            written.append(writer.submit(_write_files, out_dir / view.name, files))
+            if options.progress:
+                options.progress(done, len(wanted))
         for future in written:
             future.result()
+    if not all(_is_there(out_dir, view, options.exr) for view in views):
+        return out_dir
     for split, cameras in splits.items():
         _write_json(out_dir / f"transforms_{split}.json", _transforms(scene, split, cameras))
     scene.write_truth(out_dir)
-    _write_json(out_dir / "provenance.json", _provenance(scene, options, time.perf_counter() - started))
+    _write_json(out_dir / PROVENANCE, record | {"seconds": round(time.perf_counter() - started, 3)})
+    (out_dir / PLAN).unlink(missing_ok=True)
     return out_dir
 
 
-def _write_picture(picture: Picture, stem: Path, exposure: float, exr: bool) -> None:
-    write_png(stem.with_suffix(".png"), picture.rgba8(exposure))
-    if exr:
-        write_exr(stem.with_suffix(".exr"), exr_channels(picture))
+def views_of(splits: Mapping[str, Sequence[Camera]]) -> list[View]:
+    """All views of a data set, in the order of its splits."""
+    rows = [(f"{split}/r_{k}", camera) for split, cameras in splits.items() for k, camera in enumerate(cameras)]
+    return [View(number, name, camera) for number, (name, camera) in enumerate(rows)]
+
+
+def render_numbered(scene: Renderable, integrator: Integrator | None, seed: int, view: View) -> Picture:
+    """One view; its seed is that of the data set and its number, whoever renders it."""
+    return render_view(scene, view.camera, integrator, (seed * 1_000_003 + view.number) & 0x7FFFFFFF)
+
+
+def encode(picture: Picture, exposure: float, exr: bool) -> Files:
+    """The files of a picture."""
+    files = {".png": encode_png(picture.rgba8(exposure))}
+    return files | ({".exr": encode_exr(exr_channels(picture))} if exr else {})
+
+
+def render_files(scene: Renderable, integrator: Integrator | None, seed: int, exr: bool, view: View) -> Files:
+    """The files of one view."""
+    return encode(render_numbered(scene, integrator, seed, view), scene.exposure, exr)
+
+
+def _done(files: Files) -> Future[Files]:
+    future: Future[Files] = Future()
+    future.set_result(files)
+    return future
+
+
+def _is_there(out_dir: Path, view: View, exr: bool) -> bool:
+    return all((out_dir / f"{view.name}{end}").is_file() for end in ((".png", ".exr") if exr else (".png",)))
+
+
+def _write_files(stem: Path, files: Future[Files]) -> None:
+    for end, data in files.result().items():
+        with replacing(stem.with_name(stem.name + end)) as temporary:
+            temporary.write_bytes(data)
+
+
+def _claim(out_dir: Path, record: dict, shared: bool) -> bool:
+    """Makes the folder one that this set's pictures go to, so that its transforms never stand beside others' pictures; False
+    where there is nothing to do.
+
+    A set that was begun goes on. What was there of another set, or of this one when it is complete, goes first; unless the
+    folder is ``shared`` with other processes: then a complete set of this kind is done, and anything else is refused.
+    """
+    plan, text = out_dir / PLAN, json.dumps(record, indent=1)
+    if plan.is_file() and plan.read_text() == text:
+        return True
+    old = [p for p in out_dir.glob("*/*") if p.parent.name in SPLITS and re.fullmatch(r"\.?r_\d+.*\.(png|exr)", p.name)]
+    marks = [p for p in (plan, out_dir / PROVENANCE, *out_dir.glob("transforms_*.json")) if p.is_file()]
+    if shared and (old or marks):
+        if not plan.is_file() and _complete(out_dir) == record:
+            return False
+        raise InputError(
+            f"--out: {out_dir} holds pictures of another scene, or rendered otherwise: choose another folder"
+        )
+    for path in (*marks, *old):  # the marks of a complete set before its pictures
+        path.unlink(missing_ok=True)
+    with replacing(plan) as temporary:
+        temporary.write_text(text)
+    return True
+
+
+def _complete(out_dir: Path) -> dict | None:
+    """What a complete set is of."""
+    try:
+        found = json.loads((out_dir / PROVENANCE).read_text())
+    except (OSError, ValueError):
+        return None
+    return {key: value for key, value in found.items() if key != "seconds"} if isinstance(found, dict) else None
 
 
 def exr_channels(picture: Picture) -> dict[str, np.ndarray]:
@@ -136,7 +248,7 @@ def _transforms(scene: Renderable, split: str, cameras: list[Camera]) -> dict:
     return {"camera_angle_x": cameras[0].angle_x, "aabb": scene.aabb.tolist(), "frames": frames}
 
 
-def _provenance(scene: Renderable, options: Options, seconds: float) -> dict:
+def _provenance(scene: Renderable, options: Options) -> dict:
     import numba
 
     integrator = options.integrator
@@ -147,7 +259,6 @@ def _provenance(scene: Renderable, options: Options, seconds: float) -> dict:
         "views": options.views,
         "size": list(options.size),
         "seed": options.seed,
-        "seconds": round(seconds, 3),
         "versions": {
             "data_synth": importlib.import_module("data_synth").__version__,
             "numpy": np.__version__,

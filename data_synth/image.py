@@ -6,6 +6,7 @@ as in NeRF-synthetic; EXR files are 32-bit float, linear and premultiplied, as E
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import tempfile
@@ -85,8 +86,15 @@ def write_png(path: str | os.PathLike, pixels: np.ndarray) -> None:
         PillowImage.fromarray(pixels).save(temporary, **options)
 
 
-def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray]) -> None:
-    """Write named (H, W) channels as an uncompressed 32-bit float scan-line OpenEXR file (openexr.com, file layout)."""
+def encode_png(pixels: np.ndarray) -> bytes:
+    """(H, W), (H, W, 3) or (H, W, 4) uint8 pixels as a PNG."""
+    buffer = io.BytesIO()
+    PillowImage.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def encode_exr(channels: dict[str, np.ndarray]) -> bytes:
+    """Named (H, W) channels as an uncompressed 32-bit float scan-line OpenEXR file (openexr.com, file layout)."""
     names = sorted(channels)
     planes = np.stack([np.asarray(channels[name], dtype="<f4") for name in names], axis=1)  # (H, channel, W)
     height, _, width = planes.shape
@@ -107,10 +115,14 @@ def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray]) -> None:
     row_bytes = 4 * len(names) * width
     first = len(header) + 8 * height
     offsets = first + (row_bytes + 8) * np.arange(height, dtype="<u8")
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(header + offsets.tobytes())
-        for y in range(height):
-            file.write(struct.pack("<ii", y, row_bytes) + planes[y].tobytes())
+    lines = (struct.pack("<ii", y, row_bytes) + planes[y].tobytes() for y in range(height))
+    return b"".join([header, offsets.tobytes(), *lines])
+
+
+def write_exr(path: str | os.PathLike, channels: dict[str, np.ndarray]) -> None:
+    """Write :func:`encode_exr` of ``channels`` to ``path``."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(encode_exr(channels))
 
 
 def read_exr(path: str | os.PathLike) -> dict[str, np.ndarray]:

@@ -2,19 +2,78 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
 from nerfvol.cli.command import Command
+from nerfvol.errors import InputError
 
 
 def run(arguments: list[str]) -> int:
-    """The exit code of data_synth's command line on ``arguments``."""
+    """The exit code of data_synth's command line on ``arguments``; ``--cluster WHERE`` among them is this package's.
+
+    Raises:
+        InputError: the engine cannot be reached, or its workers cannot render this.
+    """
     from data_synth.cli import main
 
-    return main(arguments) or 0
+    argv, where = _without_cluster(arguments)
+    if where is None:
+        return main(argv) or 0
+    with contextlib.ExitStack() as stack:
+        return main(argv, _on_cluster(where, argv, stack)) or 0
+
+
+def _without_cluster(arguments: Sequence[str]) -> tuple[list[str], str | None]:
+    argv, where = [], None
+    words = iter(arguments)
+    for word in words:
+        if word == "--cluster":
+            where = next(words, "")
+        elif word.startswith("--cluster="):
+            where = word.partition("=")[2]
+        else:
+            argv.append(word)
+    if where == "":
+        raise InputError(
+            "--cluster: expected local:N, an address such as tcp://host:8786, or a scheduler file, got nothing"
+        )
+    return argv, where
+
+
+def _on_cluster(
+    where: str, argv: list[str], stack: contextlib.ExitStack
+) -> Callable[[Callable[..., Any], Sequence[Any]], Iterable[Any]]:
+    """Renders views on the workers, in the form that data_synth asks for; connects when the first views are asked for."""
+
+    def each(render: Callable[..., Any], views: Sequence[Any]) -> Iterable[Any]:
+        from nerfvol.cluster.engine import connect
+        from nerfvol.cluster.fit import Needs, with_data
+        from nerfvol.cluster.tasks import Job
+        from nerfvol.cluster.window import Window
+
+        words = [word.rpartition("=")[2] for word in argv]
+        files = [
+            word for word in words if Path(word).is_file()
+        ]  # volumes and scene files, which the workers must have too
+        here = {word: str(Path(word).resolve()) for word in files}
+        resolved = [word if (w := word.rpartition("=")[2]) not in here else word.replace(w, here[w]) for word in argv]
+        job = Job("data_synth.cli:render_task", {"argv": resolved})
+        client = stack.enter_context(connect(where))
+        window = Window(client, job, Needs(("data_synth.cli:probe",), with_data(list(here.values()))))
+        for message in window.messages:
+            print(message, file=sys.stderr)
+        return window.results(list(views))
+
+    return each
 
 
 COMMAND = Command(
     summary="Make a synthetic scene with exact ground truth.",
-    example="nerfvol synth list\nnerfvol synth showcase --out scene",
+    example="nerfvol synth list\nnerfvol synth showcase --out scene\nnerfvol synth cloud --out cloud --cluster local:2",
     options=None,
     arguments=lambda parser: None,
     run=run,

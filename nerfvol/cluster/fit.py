@@ -51,8 +51,10 @@ def fingerprint(needs: Needs) -> str:
 
 
 def listing(folder: str | Path) -> str:
-    """A hash of the names and sizes of the files in ``folder``, at any depth; "" where there is no such folder."""
+    """A hash of the names and sizes of the files in ``folder``, at any depth, or of a file; "" where there is no such thing."""
     root = Path(folder)
+    if root.is_file():
+        return hashlib.sha256(root.read_bytes()).hexdigest()
     if not root.is_dir():
         return ""
     rows = sorted(
@@ -95,7 +97,7 @@ class Fit(WorkerPlugin):
         for folder, contents in self.needs.data:
             here = listing(folder)
             if here != contents:
-                return f"{folder} is not there" if not here else f"{folder} holds other files"
+                return f"{folder} is not there" if not here else f"{folder} is another one there"
         folder = cache_folder()
         free = shutil.disk_usage(folder).free
         if free < self.needs.room:

@@ -133,7 +133,7 @@ def test_fit_asks_for_kernels_data_and_room(tmp_path, monkeypatch):
     assert Fit(mine, expected).reason() == ""
     assert "draws other pictures" in Fit(mine, "0" * 16).reason()
     (tmp_path / "scene" / "b.png").write_bytes(b"2")
-    assert "holds other files" in Fit(mine, expected).reason()
+    assert "is another one there" in Fit(mine, expected).reason()
     (tmp_path / "scene").rename(tmp_path / "elsewhere")
     assert "is not there" in Fit(mine, expected).reason()
     assert "are needed" in Fit(Needs(room=10**18), expected).reason()

@@ -103,6 +103,17 @@ def test_scores_from_workers_are_those_from_here(tmp_path, models, tiny_scene, c
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
 
 
+def test_a_synthetic_set_from_workers_is_that_from_here(tmp_path, command):
+    pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
+    given = ("synth", "sphere", "--views", "6", "--size", "12x10", "--integrator", "path", "--spp", "4", "--exr")
+    assert command(*given, "--out", tmp_path / "here")[0] == 0
+    assert command(*given, "--out", tmp_path / "there", "--cluster", "local:2")[0] == 0
+    for split in ("train", "val", "test"):
+        assert contents(tmp_path / "here" / split) == contents(tmp_path / "there" / split)
+    names = sorted(path.name for path in (tmp_path / "here").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "there").iterdir())
+
+
 def test_an_engine_that_is_not_there_is_one_sentence(tmp_path, models, command):
     code, _, said = command("render", models / "octree.safetensors", *PATH, "--out", tmp_path, "--cluster", "nowhere")
     assert code == 2 and "--cluster: expected local:N" in said

@@ -142,6 +142,66 @@ def test_dataset_has_the_nerf_synthetic_layout(tmp_path):
         assert png.read_bytes() == (tmp_path / "again" / png.relative_to(tmp_path / "out")).read_bytes()
 
 
+def _set(folder):
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in folder.rglob("*")
+        if p.is_file() and p.name != "provenance.json"
+    }
+
+
+SLAB = ("slab", "--views", "3", "--size", "8x6", "--exr")
+
+
+def test_parts_of_a_set_are_the_bytes_of_the_whole(tmp_path):
+    assert main([*SLAB, "--out", str(tmp_path / "whole")]) == 0
+    parts = [*SLAB, "--out", str(tmp_path / "parts")]
+    for frames in ("0-4/2", "3-5"):
+        assert main([*parts, "--frames", frames]) == 0
+        assert not list((tmp_path / "parts").glob("transforms*"))  # not complete yet
+    assert main([*parts, "--frames", "0-5"]) == 0
+    assert _set(tmp_path / "parts") == _set(tmp_path / "whole")
+    before = (tmp_path / "parts" / "train" / "r_0.png").stat().st_mtime_ns
+    assert main([*parts, "--frames", "0-5"]) == 0  # is complete: nothing is done
+    assert (tmp_path / "parts" / "train" / "r_0.png").stat().st_mtime_ns == before
+
+
+def test_a_set_that_was_stopped_goes_on_and_never_stands_beside_another_ones_transforms(tmp_path):
+    out, whole = tmp_path / "set", tmp_path / "whole"
+    assert main([*SLAB, "--seed", "5", "--out", str(whole)]) == 0
+    assert main(["slab", "--views", "9", "--size", "8x6", "--out", str(out)]) == 0  # a larger set of another seed
+
+    class Killed(Exception):
+        pass
+
+    def killed_after_two(render, views):
+        for k, view in enumerate(views):
+            if k == 2:
+                raise Killed
+            yield render(view)
+
+    with pytest.raises(Killed):
+        main([*SLAB, "--seed", "5", "--out", str(out)], killed_after_two)
+    assert not list(out.glob("transforms*")) and len(list(out.rglob("r_*.png"))) == 2
+    kept = (out / "train" / "r_0.png").stat().st_mtime_ns
+    assert main([*SLAB, "--seed", "5", "--out", str(out)]) == 0
+    assert _set(out) == _set(whole) and (out / "train" / "r_0.png").stat().st_mtime_ns == kept
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [("0-9", "there are the views 0-5"), ("2-1", "A up to B"), ("0-1/0", "S at least 1"), ("x", "expected A-B")],
+)
+def test_frames_that_make_no_sense_are_one_sentence(tmp_path, capsys, frames, message):
+    assert main([*SLAB, "--out", str(tmp_path), "--frames", frames]) == 2 and message in capsys.readouterr().err
+
+
+def test_a_shared_folder_of_another_set_is_refused(tmp_path, capsys):
+    assert main([*SLAB, "--out", str(tmp_path)]) == 0
+    assert main([*SLAB, "--seed", "1", "--out", str(tmp_path), "--frames", "0-1"]) == 2
+    assert "another scene" in capsys.readouterr().err and list(tmp_path.glob("transforms*"))
+
+
 def test_a_pixel_of_a_written_view_is_the_chord(tmp_path):
     """From the files alone: pose, angle and alpha of the homogeneous sphere satisfy alpha = 1 - exp(-sigma chord)."""
     write_dataset(scenes.make("sphere"), tmp_path, Options(views=1, size=(33, 33)))
