@@ -199,12 +199,6 @@ def match(job: Job, report: Report, left_out: Sequence[str] = ()) -> str:
         listed.write_text("".join(f"{a} {b}\n" for a, b in few))
         pycolmap.match_image_pairs(work / DATABASE, matching, pairing, verification)
         report("matching", len(wanted) - len(missing) + first + len(few), len(wanted))
-    mark = work / f"calibrated_{len(wanted)}"
-    if not all(group["known"] for group in job.groups) and not mark.exists():
-        calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = job.seed
-        pycolmap.calibrate_view_graph(work / DATABASE, calibration)
-        mark.touch()
     return how
 
 

@@ -9,7 +9,7 @@ from nerfvol.poses.turning import parallax
 
 
 def places(n, seed=0, revisit=()):
-    """Descriptors of pictures on a walk: each shows half of what the one before shows; ``revisit`` (i, j): j shows what i does."""
+    """Descriptors of pictures on a walk: each shows half of what the one before shows; of ``revisit`` (i, j), j shows i's."""
     rng = np.random.default_rng(seed)
     things = rng.integers(0, 255, (60 * (n + 1), 128), dtype=np.uint8)
     shown = [things[60 * i : 60 * i + 120] for i in range(n)]
