@@ -24,13 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.files.atomic import read_json, write_json
-from nerfvol.poses.pairs import choose_pairs
+from nerfvol.poses.pairs import ALL, choose_pairs, in_order
 from nerfvol.poses.turning import parallax
 
-DATABASE, MODEL, RESULT = "database.db", "model", "result.json"
+DATABASE, MODEL, RESULT, PLACED = "database.db", "model", "result.json", "placed"
 AT_ONCE, PAIRS_AT_ONCE = 8, 200
 ENOUGH = 0.9
 """Share of the photographs that the first mapper must place; else the other one has a try."""
+MOST_MORE_PAIRS = 12_000
+"""Pairs of photographs that were left out with all others, at most, that are matched before it is given up."""
 MOST_TRIALS = 2000
 """Of RANSAC for a pair: finds seven right matches where 44 % are right, with 99.9 % (COLMAP's 10,000: where 35 % are). Pairs
 that share nothing cost all of them."""
@@ -67,19 +69,30 @@ def run(job: Job, report: Report) -> dict[str, Any]:
 
     pycolmap.set_random_seed(job.seed)
     work = Path(job.work)
+    shutil.rmtree(work / MODEL, ignore_errors=True)
     seconds: dict[str, float] = {}
     with _Timed(seconds, "features"):
         extract(job, report)
     with _Timed(seconds, "matching"):
         how = match(job, report)
+    result = _map(job, report, seconds) | {"pairs": how}
+    left_out = sorted(set(job.names) - set(result["registered"]))
+    again = how != ALL and len(left_out) > (1 - ENOUGH) * len(job.names)
+    if again and len(left_out) * len(job.names) <= MOST_MORE_PAIRS:
+        with _Timed(seconds, "more matching"):
+            how = match(job, report, left_out)
+        second = _map(job, report, seconds)
+        if len(second["registered"]) > len(result["registered"]):
+            result = second | {"pairs": how}
+    result |= {"pycolmap": pycolmap.__version__, "seconds": {k: round(v, 2) for k, v in seconds.items()}}
+    write_json(work / RESULT, result)
+    return result
+
+
+def _map(job: Job, report: Report, seconds: dict[str, float]) -> dict[str, Any]:
+    """Cameras from the matches there are: by the first mapper that places enough, or by the one that places most."""
     counts, links, motion = look(job)
-    result: dict[str, Any] = {
-        "pairs": how,
-        "features": counts,
-        "links": links,
-        "motion": motion,
-        "pycolmap": pycolmap.__version__,
-    }
+    result: dict[str, Any] = {"features": counts, "links": links, "motion": motion}
     placed: list[str] = []
     tried = {}
     if links:
@@ -90,14 +103,21 @@ def run(job: Job, report: Report) -> dict[str, Any]:
                 if model is not None and model.num_reg_images() > len(placed):
                     placed = sorted(image.name for image in model.images.values() if image.has_pose)
                     result |= _describe(model) | {"mapper": mapper}
-                    shutil.rmtree(work / MODEL, ignore_errors=True)
-                    (work / MODEL).mkdir()
-                    model.write(str(work / MODEL))
+                    _keep(model, Path(job.work) / MODEL, len(placed))
                 if len(placed) >= ENOUGH * len(job.names):
                     break
-    result |= {"registered": placed, "tried": tried, "seconds": {k: round(v, 2) for k, v in seconds.items()}}
-    write_json(work / RESULT, result)
-    return result
+    return result | {"registered": placed, "tried": tried}
+
+
+def _keep(model: Any, folder: Path, placed: int) -> None:
+    """Writes the model unless one of more photographs is there."""
+    most = folder / PLACED
+    if most.is_file() and int(most.read_text()) >= placed:
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    model.write(str(folder))
+    most.write_text(str(placed))
 
 
 class _Timed:
@@ -108,7 +128,7 @@ class _Timed:
         self.started = time.perf_counter()
 
     def __exit__(self, *failure: object) -> None:
-        self.into[self.name] = time.perf_counter() - self.started
+        self.into[self.name] = self.into.get(self.name, 0.0) + time.perf_counter() - self.started
 
 
 def extract(job: Job, report: Report) -> None:
@@ -147,15 +167,20 @@ def extract(job: Job, report: Report) -> None:
             report("features", done, len(all_names))
 
 
-def match(job: Job, report: Report) -> str:
-    """Matches and verifies the pairs that are not matched yet; how pairs were chosen, in words."""
+def match(job: Job, report: Report, left_out: Sequence[str] = ()) -> str:
+    """Matches and verifies the pairs that are not matched yet; how pairs were chosen, in words. ``left_out``: photographs to
+    match with all others."""
     import pycolmap
 
     work = Path(job.work)
     with _open(work / DATABASE) as database:
-        images = sorted(database.read_all_images(), key=lambda image: image.name)
+        images = sorted(database.read_all_images(), key=lambda image: in_order(image.name))
         descriptors = [np.asarray(_array_of(database.read_descriptors(image.image_id))) for image in images]
         wanted, how = choose_pairs(descriptors, job.seed)
+        if left_out:
+            far = [k for k, image in enumerate(images) if image.name in set(left_out)]
+            more = {(min(i, j), max(i, j)) for i in far for j in range(len(images)) if i != j}
+            wanted, how = sorted(more | set(wanted)), f"{how}; {len(far)} that were left out with all"
         missing = [
             (images[i].name, images[j].name)
             for i, j in wanted
@@ -174,11 +199,6 @@ def match(job: Job, report: Report) -> str:
         listed.write_text("".join(f"{a} {b}\n" for a, b in few))
         pycolmap.match_image_pairs(work / DATABASE, matching, pairing, verification)
         report("matching", len(wanted) - len(missing) + first + len(few), len(wanted))
-    if not all(group["known"] for group in job.groups) and not (work / "calibrated").exists():
-        calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = job.seed
-        pycolmap.calibrate_view_graph(work / DATABASE, calibration)
-        (work / "calibrated").touch()
     return how
 
 

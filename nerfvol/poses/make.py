@@ -22,7 +22,7 @@ from nerfvol.machine import describe_hardware
 from nerfvol.measure.sharpness import sharpness
 from nerfvol.poses import sources, video
 from nerfvol.poses.child import Progress, require_pycolmap, run_engine
-from nerfvol.poses.engine import MODEL, Job
+from nerfvol.poses.engine import MODEL, PLACED, Job
 from nerfvol.poses.verdict import failure, remarks
 
 WORK, IMAGES, REPORT = "poses_work", "images", "poses.json"
@@ -201,6 +201,7 @@ def _publish(work: Path, folder: Path) -> None:
     target = folder / "sparse" / "0"
     target.parent.mkdir(exist_ok=True)
     shutil.rmtree(target, ignore_errors=True)
+    (work / MODEL / PLACED).unlink(missing_ok=True)
     os.replace(work / MODEL, target)
 
 

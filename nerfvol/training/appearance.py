@@ -23,7 +23,8 @@ MOMENTS = (0.05, 0.1, 0.16, 0.23, 0.33, 0.45, 0.6, 0.8)
 """Of a run's progress, at which maps are fitted."""
 SPREAD = 0.08
 """Standard deviation of the exposures, as factors, from which on maps are used (uniform within 14 % to either side). Below, a
-model's view dependence takes them up as well: at 5 % (a cup photographed by a phone) maps gain 0.4 dB after a fit and lose 1.1 plainly."""
+model's view dependence takes them up as well: at 5 % (a cup photographed by a phone) maps gain 0.4 dB after a
+fit and lose 1.1 plainly."""
 LEAST_SHOWN = 0.6
 """Share of a photograph's variance that the model must show, in the median, before exposures are asked for: fog would take the
 bright side of a thing for an exposure."""

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from nerfvol.poses import pairs as pairs_module
-from nerfvol.poses.pairs import alike, choose_pairs
+from nerfvol.poses.pairs import alike, choose_pairs, in_order
 from nerfvol.poses.turning import parallax
 
 
 def places(n, seed=0, revisit=()):
-    """Descriptors of pictures on a walk: each shows half of what the one before shows; ``revisit`` (i, j): j shows what i does."""
+    """Descriptors of pictures on a walk: each shows half of what the one before shows; of ``revisit`` (i, j), j shows i's."""
     rng = np.random.default_rng(seed)
     things = rng.integers(0, 255, (60 * (n + 1), 128), dtype=np.uint8)
     shown = [things[60 * i : 60 * i + 120] for i in range(n)]
@@ -21,6 +21,11 @@ def places(n, seed=0, revisit=()):
 def test_all_pairs_where_that_is_cheap():
     chosen, how = choose_pairs(places(8))
     assert len(chosen) == 28 and how == "all pairs" and all(i < j for i, j in chosen)
+
+
+def test_names_are_in_the_order_of_their_numbers():
+    names = ["IMG_10.jpg", "IMG_9.jpg", "b2.png", "b10.png", "a.jpg"]
+    assert sorted(names, key=in_order) == ["a.jpg", "b2.png", "b10.png", "IMG_9.jpg", "IMG_10.jpg"]
 
 
 def test_a_walk_that_comes_back_is_closed(monkeypatch):

@@ -48,7 +48,7 @@ def test_half_is_enough_and_the_rest_is_named():
 
 @pytest.mark.parametrize("camera,sentence", [
     ({"lens": "SIMPLE_RADIAL", "width": 1000, "height": 800, "focal": 90.0, "parameters": [90.0, 0, 0, 0.0]}, "160 degrees"),
-    ({"lens": "OPENCV", "width": 1000, "height": 800, "focal": 900.0, "parameters": [900, 900, 0, 0, -0.7, 0, 0, 0]}, "fisheye"),
+    ({"lens": "OPENCV", "width": 1000, "height": 800, "focal": 900.0, "parameters": [900] * 4 + [-0.7, 0, 0, 0]}, "fisheye"),
 ])  # fmt: skip
 def test_cameras_that_cannot_be(camera, sentence):
     assert sentence in " ".join(remarks(result(chain(0, 11), NAMES, cameras=[camera]), NAMES))
