@@ -20,11 +20,11 @@ from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_model import CompiledField
 from nerfvol.kernels.field_ops import FieldBatch, FieldLoss, FieldRates, FieldState, March, Occupancy
 from nerfvol.native import native
+from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera, Intrinsics
     from nerfvol.datasets.dataset import Dataset
-    from nerfvol.training.field_trainer import FieldReport
 
 MOST_RAYS = 32768
 """Of one step, while most of space is known to be empty."""
@@ -132,8 +132,6 @@ class CompiledFieldTrainer:
 
     def share_of(self, seconds: float) -> float:
         """``field.time_budget``, and at most FIELD_SHARE: an octree must follow."""
-        from nerfvol.training.field_trainer import FIELD_SHARE
-
         return min(self.config.time_budget, FIELD_SHARE * seconds)
 
     def size(self) -> str:
@@ -142,7 +140,7 @@ class CompiledFieldTrainer:
 
     def seconds_to_write(self) -> float:
         """Distilling comes first."""
-        return 2.0
+        return SECONDS_TO_DISTILL
 
     def needs_images(self) -> bool:
         """The octree will."""
@@ -167,8 +165,6 @@ class CompiledFieldTrainer:
         Args:
             progress: how much of the run is over, 0 to 1; None = steps done / ``config.steps``.
         """
-        from nerfvol.training.field_trainer import FieldReport
-
         config = self.config
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         stage = config.stage_at(progress)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,9 +21,9 @@ from nerfvol.field.layout import Domain
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
 from nerfvol.kernels import field_ops
-from nerfvol.kernels.state import StepReport
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
 from nerfvol.training.compiled_field import CompiledFieldTrainer
+from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
@@ -52,10 +51,6 @@ MOST_RAYS = 8192
 """Of one step, while most of space is known to be empty."""
 NEAREST = 0.05
 """Sample to a camera among photographs, in units of half the inner cube's edge."""
-FIELD_SHARE = 0.3
-"""Of the time left in a run, the most that the field gets."""
-SECONDS_TO_DISTILL = 2.0
-"""Kept for the end of a run while a field is trained: what an octree takes to be written."""
 
 
 def make_field_trainer(
@@ -183,20 +178,6 @@ def _shade_in_pieces(
     parts = [field(p, v) for p, v in zip(positions.split(piece), viewdirs.split(piece), strict=True)]
     sigmas, rgb = (torch.cat(column) for column in zip(*parts, strict=True))
     return rgb, composite_packed(sigmas, samples.t_ends - samples.t_starts, samples.ray_indices, len(rays_o))
-
-
-@dataclass(frozen=True)
-class FieldReport(StepReport):
-    """squared_error: of the batch; samples: a ray; loss: with the regularisers; downscale: of the images in the batch."""
-
-    loss: float
-    n_rays: int
-    downscale: int
-
-    @property
-    def psnr(self) -> float:
-        """Of the batch, dB."""
-        return -10 * math.log10(max(self.squared_error, 1e-12))
 
 
 class FieldTrainer:

@@ -30,7 +30,8 @@ runs have at their peak next to the arrays named below."""
 FIELD_BYTES = 310 << 20
 """torch, the code that it compiles and what the training of a field leaves behind: measured."""
 DISTILL_BYTES = 290 << 20
-"""Next to the field and the images: an octree of candidates before and after leaves were merged (0.9 million for lego)."""
+"""Next to the field, the images and their pixels over the background (3 bytes each): an octree of candidates before
+and after leaves were merged (0.9 million for lego)."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
@@ -137,7 +138,7 @@ def estimate_training(
         octree=octree,
         change=change,
         leaves=leaves,
-        distillation=dataset.nbytes + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
+        distillation=dataset.nbytes + 3 * pixels + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
     )
 
 

@@ -18,8 +18,8 @@ DOMAINS = {"bounded": fields.INSIDE, "background": fields.OUTSIDE}
 @pytest.mark.parametrize("n_steps", [16, 48, 200])
 def test_exactly_the_steps_in_occupied_cells(isa, domain, n_steps):
     """Steps from longer than a coarse cell to a fraction of a cell; against every step in float64."""
-    march = fields.scattered(DOMAINS[domain], n_steps)
-    state, batch = fields.field(fields.HASHED, DOMAINS[domain]), fields.rays(2000, DOMAINS[domain], seed=4)
+    march = fields.scattered(DOMAINS[domain], n_steps, share=0.001)  # most of the coarse cells are empty too
+    state, batch = fields.field(fields.HASHED, DOMAINS[domain]), fields.rays(4000, DOMAINS[domain], seed=4)
     ours = field_ops.march_rays(state, batch, march)
     without = field_ops.march_rays(state, batch, dataclasses.replace(march, coarse=False))
     assert np.array_equal(ours, without)
@@ -32,7 +32,7 @@ def test_exactly_the_steps_in_occupied_cells(isa, domain, n_steps):
     first = near.clamp(min=march.near_plane).numpy() + (batch.jitter - 0.5) * march.edges[1]
     rays = samples.ray_indices.numpy()
     expected[rays, np.abs(start - first[rays]).argmin(0)] = True
-    assert expected.sum() > 60 and not ours[2].any()
+    assert expected.sum() > 30 and not ours[2].any()
     # Rounding may decide differently for middles on a cell's wall: one in a thousand is far more than there are.
     assert (ours != expected).sum() <= max(1, expected.sum() // 1000)
 

@@ -1,4 +1,4 @@
-"""The trainer by compiled kernels: it learns, resumes to the same bits with any number of threads, empties space, and is chosen."""
+"""The trainer by compiled kernels: it learns, resumes to the same bits with any threads, empties space, and is chosen."""
 
 import dataclasses
 import math
@@ -45,7 +45,7 @@ def assert_same_bits(a: CompiledFieldTrainer, b: CompiledFieldTrainer) -> None:
 
 
 def test_learns_the_ball(compiled, dataset: Dataset) -> None:
-    """Better than any constant image by 12 dB within 400 steps; most of the region is found empty; little is wasted at first."""
+    """Better than any constant image by 12 dB within 400 steps; most of the region is found empty."""
     trainer = trainer_of(dataset)
     reports = [trainer.step() for _ in range(257)]
     assert reports[0].samples * reports[0].n_rays <= 4 * SMALL.samples_per_step
