@@ -81,9 +81,10 @@ def resource(name: str) -> bytes:
 
 def page_settings(model: Model, name: str) -> dict[str, Any]:
     """What the page knows of a model before it has opened it: words, background, orbit, range of depths; JSON-able."""
-    stored = model.metadata.get("orbit")
-    known = isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys()
-    orbit = dict(stored) if known else default_orbit(model.aabb())
+    orbit: dict[str, Any] = default_orbit(model.aabb())
+    known = model.metadata.get("orbit")
+    if isinstance(known, dict) and {"center", "radius", "elevation_deg"} <= known.keys():
+        orbit = dict(known)
     cameras = orbit_cameras(4, orbit, (96, 96))
     return {
         "name": name, "orbit": orbit, "background": list(model.metadata.get("background", WHITE)),

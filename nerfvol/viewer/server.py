@@ -96,7 +96,7 @@ class ViewServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: ViewServer
+    server: ViewServer  # type: ignore[assignment]  # pyright: ignore[reportIncompatibleVariableOverride]
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "nerfvol", ""
     timeout = 60
