@@ -19,7 +19,6 @@ from data_synth import (
     sggx,
     spongecake,
     surfaces,
-    transmittance,
     volumes,
 )  # fmt: skip
 from data_synth.cameras import Camera, Viewpoints, look_at

@@ -94,4 +94,4 @@ def _holds(shape: np.ndarray, p: np.ndarray) -> np.ndarray:
         return np.asarray((p - shape[2:5]) @ shape[5:8] < 0)
     if shape[0] == surfaces.SPHERE:
         return ((p - shape[2:5]) ** 2).sum(axis=-1) < shape[5] ** 2
-    return ((p > shape[2:5]) & (p < shape[5:8])).all(axis=-1)
+    return np.asarray(((p > shape[2:5]) & (p < shape[5:8])).all(axis=-1))
