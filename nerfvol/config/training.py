@@ -151,7 +151,7 @@ class FieldConfig(Checked):
     bfloat16: bool = True
     """Where the field trains in torch: network arithmetic in bfloat16 (2 to 3 times as fast where the processor has it)."""
     trainer: Literal["auto", "torch"] = "auto"
-    """By the compiled kernels where they can hold the network (auto), or always in torch, some ten times slower."""
+    """By the compiled kernels where they can hold the network (auto), or always in torch, which is far slower."""
 
     def check(self) -> None:
         same_length(self, "downscales", "stage_ends", "march_steps")
