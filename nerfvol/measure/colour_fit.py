@@ -51,7 +51,7 @@ def apply_map(colour_map: Map, image: NDArray[np.floating]) -> NDArray[np.float3
 def inverse(colour_map: Map) -> Map:
     """The map that undoes ``colour_map``; LinAlgError where there is none."""
     linear = np.linalg.inv(colour_map[:, :3])
-    return np.concatenate([linear, -(linear @ colour_map[:, 3:])], axis=1)
+    return np.asarray(np.concatenate([linear, -(linear @ colour_map[:, 3:])], axis=1), dtype=np.float64)
 
 
 def compose(outer: Map, inner: Map) -> Map:
