@@ -130,9 +130,11 @@ def broken(data: bytes, rng: random.Random) -> bytes:
 # ------------------------------------------------------------------ what is read
 def of_json(path: Path) -> Callable[[random.Random], None]:
     whole = json.loads(path.read_text())
-    return lambda rng: (
-        path.write_text(json.dumps(damaged(whole, rng)), encoding="utf-8", errors="surrogatepass") and None
-    )
+
+    def change(rng: random.Random) -> None:
+        path.write_text(json.dumps(damaged(whole, rng)), encoding="utf-8", errors="surrogatepass")
+
+    return change
 
 
 def of_bytes(path: Path) -> Callable[[random.Random], None]:

@@ -77,7 +77,7 @@ class Lens(ABC):
         """Unit directions (n, 3) as of :meth:`undistort`, and where there is one, (n,) bool; elsewhere along the axis."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what overflows does not converge
             directions = self._undistort(plane)
-        found: NDArray[np.bool_] = np.isfinite(directions).all(axis=1)
+        found = np.logical_and.reduce(np.isfinite(directions), axis=1)
         return np.where(found[:, None], directions, (0.0, 0.0, 1.0)), found
 
     @abstractmethod

@@ -275,7 +275,8 @@ def test_bad_data(tmp_path, command, what):
             write_png(path, np.zeros((24, 24, 4)))
     else:
         document = json.loads(listing.read_text())
-        document["frames"][1]["transform_matrix"][0][3] = float("nan")
+        for frame in document["frames"]:
+            frame["transform_matrix"][0][3] = float("nan")
         listing.write_text(json.dumps(document))
     code, _, err = command("train", "--data", scene, "--out", tmp_path / "run", "--time-budget", "5s")
     assert code == 2 and err.strip().splitlines()[-1].startswith("nerfvol: error: ")

@@ -198,7 +198,7 @@ def photographs_of(n=6, alpha=False):
 
 def test_objects_begin_at_random_and_grey_photographs_fall_back():
     start = choose_start(*photographs_of(alpha=True))
-    assert start.name == "random" and len(start.cloud) == 3000 and "transparent" in start.sentence
+    assert start.name == "random" and len(start.cloud) == 3000 and "seen whole" in start.sentence
     start = choose_start(*photographs_of())
     assert start.name == "random" and len(start.cloud) and "too little texture" in start.sentence
     with pytest.raises(InputError, match="'sweep' cannot be used: .*texture"):
