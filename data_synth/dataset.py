@@ -23,7 +23,6 @@ from data_synth.image import Picture, encode_exr, encode_png, replacing
 from data_synth.integrators import Integrator
 from data_synth.scene import Scene
 
-
 Files = dict[str, bytes]
 """The files of a view by the end of their names."""
 

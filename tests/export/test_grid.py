@@ -44,7 +44,7 @@ def test_an_npy_of_opacity_and_its_sidecar(tmp_path, model):
 
 
 def test_what_cannot_be(tmp_path, model, command):
-    with pytest.raises(InputError, match=r"goes to .*\.ply \(points\)"):
+    with pytest.raises(InputError, match=r"goes to .*\.ply"):
         export_model(SplatModel(random_splats(3, 1, 0)), tmp_path / "g.npz")
     with pytest.raises(InputError, match="between 1 and 2048, got 100000"):
         export_model(model, tmp_path / "g.npz", resolution=100_000)

@@ -229,6 +229,9 @@ def test_a_path_is_read_by_render_and_comes_back(fresh, tmp_path):
     assert np.linalg.norm(middle.position - seen[1]["position"]) < 0.05
     steps = np.linalg.norm(np.diff([c.position for c in cameras], axis=0), axis=1)
     assert steps.max() < 3 * steps.mean()  # no jumps
+    ways = np.diff([c.position for c in cameras], axis=0) / steps[:, None]
+    bends = np.arccos(np.clip((ways[1:] * ways[:-1]).sum(1), -1, 1))
+    assert bends.max() < 3 * bends.mean()  # and no corners
     fresh.evaluate("(path) => { nerfvol.state.keys.length = 0; nerfvol.readPath(path); }", path)
     assert fresh.evaluate("nerfvol.path") == path
 
