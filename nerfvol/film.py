@@ -232,7 +232,7 @@ RECORD = "film.json"
 
 
 def _claim(out: Path, of: str) -> bool:
-    """Notes in ``out`` what its pictures are of; whether they were of it before. InputError where they are of something else."""
+    """Notes in ``out`` what its pictures are of; whether they were so before. InputError where they are of something else."""
     path = out / RECORD
     if not path.is_file():
         write_json(path, {"of": of})

@@ -56,8 +56,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
                    "(with --save-images: slices of both)")  # fmt: skip
     add_drawing(p)
-    p.add_argument("--cluster", metavar="WHERE", help="on the workers of an engine, which must see the data: local:N, "
-                   "tcp://host:8786 or a scheduler file; the same scores (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
+    p.add_argument("--cluster", metavar="WHERE", help="on the workers of an engine, which must see the data: "
+                   "local:N, tcp://host:8786 or a scheduler file; same scores (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
 
 
 def run(options: EvalOptions) -> int:

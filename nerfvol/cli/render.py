@@ -77,8 +77,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "depth are averaged first, so that neither gaps nor overlaps show; over: one almost opaque disc or ball "
                    "over the other, as viewers of splats draw them (default: surface)")  # fmt: skip
     add_drawing(p)
-    p.add_argument("--cluster", metavar="WHERE", help="draw on the workers of an engine: local:N, tcp://host:8786 or a scheduler "
-                   "file; the same bytes (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
+    p.add_argument("--cluster", metavar="WHERE", help="draw on the workers of an engine: local:N, tcp://host:8786 or a "
+                   "scheduler file; the same bytes (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
 
 
 def run(options: RenderOptions) -> int:

@@ -30,8 +30,8 @@ def evaluate(
 ) -> dict[str, Any]:  # fmt: skip
     """What scores.evaluate returns of the model in ``path``, the views drawn and scored by a client's workers.
 
-    ``settings``: background, early_stop_eps, lod, composite and LOADING, with which ``dataset`` was loaded; the workers must have
-    the same files at the same place. ``say``: gets sentences on workers that take no part.
+    ``settings``: background, early_stop_eps, lod, composite and LOADING, with which ``dataset`` was loaded; the workers must
+    have the same files at the same place. ``say``: gets sentences on workers that take no part.
     """
     from nerfvol.cluster.fit import Needs, with_data
     from nerfvol.cluster.ship import describe
