@@ -57,7 +57,7 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "(with --save-images: slices of both)")  # fmt: skip
     add_drawing(p)
     p.add_argument("--cluster", metavar="WHERE", help="on the workers of an engine, which must see the data: "
-                   "local:N, tcp://host:8786 or a scheduler file; same scores (needs nerfvol[cluster]; docs/cluster.md)")  # fmt: skip
+                   "local:N, tcp://host:8786 or a scheduler file; same scores (docs/cluster.md)")  # fmt: skip
 
 
 def run(options: EvalOptions) -> int:
