@@ -6,7 +6,8 @@ import pytest
 from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
-from nerfvol.splats.splats import Splats, rotations
+from nerfvol.rotations import rotations
+from nerfvol.splats.splats import Splats
 from nerfvol.starts.leaves import BLUR, FAINTEST, PIXELS, SCALES, SPACING, WIDEST, octree_around
 
 SCENE = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, False)

@@ -6,8 +6,8 @@ import pytest
 from nerfvol.errors import InputError
 from nerfvol.octree.rows import explin_inverse
 from nerfvol.octree.tree import Octree
+from nerfvol.rotations import rotations
 from nerfvol.splats.points import Y00
-from nerfvol.splats.splats import rotations
 from nerfvol.starts.surfels import AGREEMENT, LARGEST, THICKNESS, WIDTH, surfels
 from tests.fixtures.tiny import TINY_RADIUS, make_sphere_octree
 

@@ -7,8 +7,9 @@ from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import psnr
 from nerfvol.region import SceneBounds
+from nerfvol.rotations import turning_z_to
 from nerfvol.splats.points import dc_of_colour
-from nerfvol.splats.splats import Splats, turning_z_to
+from nerfvol.splats.splats import Splats
 from nerfvol.training import convert
 from nerfvol.training.convert import cameras_around, octree_of, seen_by, splats_of
 from nerfvol.views import OctreeModel, SplatModel

@@ -12,9 +12,9 @@ from nerfvol.export.page import first_camera
 from nerfvol.export.page_size import stored
 from nerfvol.files.page import OPENING, read_model
 from nerfvol.models import describe_file, load_model
+from nerfvol.rotations import rotations
 from nerfvol.splats.codec import quaternions, rotation_vectors
 from nerfvol.splats.io import load_splats, save_splats
-from nerfvol.splats.splats import rotations
 from nerfvol.views import OctreeModel, SplatModel
 from tests.viewer.scenes import METADATA, ball, cloud_of_splats
 
