@@ -14,7 +14,7 @@ demo: $(BIN)/python
 
 test: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 # Style, format and types, as pyproject.toml says.
 lint: $(BIN)/python

@@ -235,16 +235,16 @@ def _opened(argv: tuple[str, ...]) -> tuple[argparse.Namespace, Renderable, Inte
     return args, scene, _integrator(args, scene)
 
 
-def probe() -> bytes:
-    """What tells machines apart that would render other bytes: small pictures of two scenes by all their integrators."""
-    found = b""
-    for name in ("sphere", "showcase"):
-        scene = scenes.make(name)
-        camera = scene.viewpoints.camera(30.0, 20.0, 8, 6)
-        for integrator in scene.integrators if isinstance(scene, Scene) else ("",):
-            picture = render_view(scene, camera, integrators.make(integrator) if integrator else None, 1)
-            found += picture.rgb.tobytes() + encode_png(picture.rgba8(1.0))
-    return found
+def probe(what: str) -> bytes:
+    """What tells machines apart that would render other bytes: a small picture of the scene "NAME:INTEGRATOR".
+
+    Of a scene file, whose name is not one of the scenes', the sphere by its path tracer.
+    """
+    name, _, integrator = what.partition(":")
+    scene = scenes.make(name if name in scenes.SCENES else "sphere")
+    chosen = integrators.make(integrator or scene.integrators[0]) if isinstance(scene, Scene) else None
+    picture = render_view(scene, scene.viewpoints.camera(30.0, 20.0, 8, 6), chosen, 1)
+    return picture.rgb.tobytes() + encode_png(picture.rgba8(1.0))
 
 
 def _portrait(scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace) -> int:

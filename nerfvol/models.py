@@ -100,7 +100,7 @@ def describe_file(target: str | os.PathLike[str]) -> dict[str, Any]:
                 return file.document
         except InputError as error:
             raise InputError(
-                f"{error} (a model is a run folder, its .safetensors file, a page, {' or '.join(SUFFIXES)})"
+                f"{error} (a model is a run folder, its .safetensors file, a page, {', '.join(SUFFIXES)})"
             ) from error
 
 

@@ -323,7 +323,7 @@ def test_render_pictures_and_their_cameras(tmp_path, octree_file, command):
     code, text, _ = command("render", octree_file, "--orbit", 3, "--size", "24x16", "--out", out, "--aov", aovs)
     assert code == 0 and "3 views" in text
     names = {f"000{i}{aov}.png" for i in range(3) for aov in ("", "_depth", "_opacity", "_normal", "_median_depth")}
-    assert {p.name for p in out.iterdir()} == names | {"cameras.json"}
+    assert {p.name for p in out.iterdir()} == names | {"cameras.json", "film.json"}
     picture = np.asarray(Image.open(out / "0000.png"))
     assert picture.shape == (16, 24, 3) and np.all(picture[0, 0] == 0)  # the background stored with the octree
     again = tmp_path / "again"

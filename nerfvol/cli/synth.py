@@ -63,7 +63,10 @@ def _on_cluster(
         resolved = [word if (w := word.rpartition("=")[2]) not in here else word.replace(w, here[w]) for word in argv]
         job = Job("data_synth.cli:render_task", {"argv": resolved})
         client = stack.enter_context(connect(where))
-        window = Window(client, job, Needs(("data_synth.cli:probe",), with_data(list(here.values()))))
+        integrator = next((argv[k + 1] for k, word in enumerate(argv[:-1]) if word == "--integrator"), "")
+        probe = f"data_synth.cli:probe?{argv[0]}:{integrator}"
+        # Workers may have to compile first.
+        window = Window(client, job, Needs((probe,), with_data(list(here.values())), patience=600.0))
         for message in window.messages:
             print(message, file=sys.stderr)
         return window.results(list(views))

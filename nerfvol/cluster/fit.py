@@ -30,14 +30,16 @@ PATIENCE = 60.0
 
 @dataclass(frozen=True)
 class Needs:
-    """What a job asks of a machine. probes: "module:function", each without arguments, that return bytes.
+    """What a job asks of a machine. probes: "module:function" or "module:function?argument", that return bytes.
 
-    data: folders that must be there with the same listing; room: bytes that its cache may take.
+    data: files and folders that must be there as they are here; room: bytes that its cache may take; patience: seconds to wait
+    for a worker that is fit.
     """
 
     probes: tuple[str, ...] = ("nerfvol.cluster.probe:pictures",)
     data: tuple[tuple[str, str], ...] = ()
     room: int = 0
+    patience: float = PATIENCE
 
 
 def fingerprint(needs: Needs) -> str:
@@ -46,7 +48,8 @@ def fingerprint(needs: Needs) -> str:
 
     digest = hashlib.sha256(__version__.encode())
     for probe in needs.probes:
-        digest.update(hashlib.sha256(named(probe)()).digest())
+        name, _, argument = probe.partition("?")
+        digest.update(hashlib.sha256(named(name)(*([argument] if argument else []))).digest())
     return digest.hexdigest()[:16]
 
 
@@ -105,13 +108,14 @@ class Fit(WorkerPlugin):
         return ""
 
 
-def welcome(client: Client, needs: Needs, patience: float = PATIENCE) -> tuple[str, list[str]]:
+def welcome(client: Client, needs: Needs) -> tuple[str, list[str]]:
     """The resource that tasks ask for, once a worker is fit, and a sentence for each worker that is not.
 
     Raises:
-        InputError: nobody is after ``patience`` seconds; the sentence names the workers and what is wrong with them.
+        InputError: nobody is after ``needs.patience`` seconds; the sentence names the workers and what is wrong with them.
     """
     plugin = Fit(needs, fingerprint(needs))
+    patience = needs.patience
     deadline = time.monotonic() + patience
     while True:
         try:

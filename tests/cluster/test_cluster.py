@@ -119,7 +119,7 @@ def test_what_fails_everywhere_is_one_sentence(client):
 
 def test_workers_that_draw_otherwise_are_named(client):
     with pytest.raises(InputError) as caught:
-        fit.welcome(client, Needs(probes=("tests.cluster.work:other_probe",)), patience=2.0)
+        fit.welcome(client, Needs(probes=("tests.cluster.work:other_probe",), patience=2.0))
     assert all(address in str(caught.value) for address in workers(client))
     assert "draws other pictures" in str(caught.value)
 

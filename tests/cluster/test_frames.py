@@ -105,7 +105,7 @@ def test_scores_from_workers_are_those_from_here(tmp_path, models, tiny_scene, c
 
 def test_a_synthetic_set_from_workers_is_that_from_here(tmp_path, command):
     pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
-    given = ("synth", "sphere", "--views", "6", "--size", "12x10", "--integrator", "path", "--spp", "4", "--exr")
+    given = ("synth", "sphere", "--views", "6", "--size", "12x10", "--integrator", "emission", "--exr")
     assert command(*given, "--out", tmp_path / "here")[0] == 0
     assert command(*given, "--out", tmp_path / "there", "--cluster", "local:2")[0] == 0
     for split in ("train", "val", "test"):

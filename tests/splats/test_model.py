@@ -120,7 +120,7 @@ def test_an_unknown_storage_is_one_sentence_from_every_model(tmp_path, sphere_oc
     """Splats have one storage; a wrong name is still a mistake."""
     points = PointModel(PointCloud(np.eye(3), np.full((3, 3), 0.5, np.float32)))
     for model in (OctreeModel(sphere_octree), SplatModel(wall(step=1.0)), points):
-        with pytest.raises(InputError, match="storage should be float32, float16 or compact, got 'int3'"):
+        with pytest.raises(InputError, match="storage should be float32, float16, compact or mapped, got 'int3'"):
             model.save(tmp_path / "a.safetensors", "int3")
     assert not (tmp_path / "a.safetensors").exists()
 

@@ -36,7 +36,7 @@ def test_the_pictures_are_released_once_they_are_in_tiles(
 
     monkeypatch.setattr(session.Run, "follow", look)
     octree = {**TINY["octree"], "downscales": downscales}
-    start(settings(tiny_scene, tmp_path, octree=octree, checkpoint_every=checkpoint_every))
+    start(settings(tiny_scene, tmp_path, octree=octree, checkpoint_every=checkpoint_every, appearance="off"))
     stages, found = zip(*held, strict=True)
     needed = stages.index(last) + 1
     assert found == (True,) * needed + (False,) * (60 - needed)

@@ -79,7 +79,7 @@ def test_a_limit_is_kept_and_used(tmp_path, kind, share):
     export_model(model, tmp_path / "full.html")
     overhead = (tmp_path / "full.html").stat().st_size - full
     limit = int(overhead + share * full)
-    _, size = export_model(model, tmp_path / "small.html", max_bytes=limit)
+    size = export_model(model, tmp_path / "small.html", max_bytes=limit).size
     assert size == (tmp_path / "small.html").stat().st_size
     assert limit - 0.1 * share * full <= size <= limit
     small = load_model(tmp_path / "small.html")
@@ -115,7 +115,7 @@ def test_a_limit_that_is_too_small_and_other_wrong_options(tmp_path, capsys):
     for options, sentence in (
         (["--max-bytes", "50kB"], "--max-bytes is 50000, the page takes"),
         (["--max-bytes", "much"], "expected bytes such as"),
-        (["--crop", "5,5,5,6,6,6"], "nothing of the model lies in the box"),
+        (["--crop", "5,5,5,6,6,6"], "nothing of the model lies in this box"),
         (["--level", "0"], "level"),
     ):
         assert main(["export", model, "--out", out, *options]) == 2
