@@ -77,7 +77,9 @@ def _read_numpy(path: Path) -> tuple[np.ndarray, np.ndarray]:
                 return stored, np.ones(3)
             if path.suffix == ".npy" or isinstance(stored, np.ndarray):
                 held = ("one array", "an archive of arrays")[path.suffix == ".npy"]
-                raise InputError(f"{path}: it holds {held}; such a file's name ends in {'.npy' if path.suffix == '.npz' else '.npz'}")
+                raise InputError(
+                    f"{path}: it holds {held}; such a file's name ends in {'.npy' if path.suffix == '.npz' else '.npz'}"
+                )
             names = [n for n in ("density", *stored.files) if n in stored.files and stored[n].ndim == 3]
             if not names:
                 raise InputError(f"{path}: expected a 3D array, got {', '.join(stored.files) or 'nothing'}")

@@ -67,7 +67,10 @@ def lost_digits(splats: Splats) -> str | None:
     The layout has no double positions, and viewers read none: such splats are moved to near the origin before they are written.
     """
     far = float(np.abs(splats.origin).max())
-    rounding, width = float(np.spacing(np.float32(far))), float(np.exp(np.median(splats.log_scales))) if splats.n else 1.0
+    rounding, width = (
+        float(np.spacing(np.float32(far))),
+        float(np.exp(np.median(splats.log_scales))) if splats.n else 1.0,
+    )
     if rounding <= width:
         return None
     return (

@@ -50,7 +50,7 @@ FINE_LEVEL = 9
 FINE_STEPS = 2500
 """... is left out where fewer steps would be left for it."""
 PRUNE_SHARE, FEWEST_PRUNE_STEPS = 0.05, 10
-"""Of the steps that a run will make at its pace, what comes before a pruning at most, and the fewest: a run that has no time for
+"""Of the steps that a run will make, what comes before a pruning at most, and the fewest: a run that has no time for
 ``prune_steps`` in each stage had better be rough in all of them than stay in the first."""
 BETA = 0.98
 """Memory, per step, of RMSprop's second moments."""
