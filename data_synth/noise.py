@@ -6,8 +6,8 @@ three textures of the method once per seed and keeps them in the user's cache fo
 
 from __future__ import annotations
 
-import math
 import contextlib
+import math
 import os
 from pathlib import Path
 from typing import NamedTuple

@@ -30,7 +30,7 @@ VIEWS = 40
 RESOLUTION = 512
 _OPAQUE = {"surface": 0.9, "centers": 0.5}
 _DIGITS = 1e-4
-"""Share of the model's size: where float32 rounds positions by more, they are written as double, as PDAL and CloudCompare do."""
+"""Share of the model's size: where float32 rounds positions by more, they are doubles."""
 _AGREE = 2.0  # voxels between a point and the surface that another view sees
 
 

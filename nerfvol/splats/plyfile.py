@@ -188,7 +188,7 @@ class PlyFile:
 def write_ply(
     path: str | os.PathLike[str], comments: Sequence[str], columns: Mapping[str, NDArray], faces: NDArray | None = None
 ) -> int:
-    """Write ``columns`` (n,), bytes and float64 as they are and all others as float32, as the vertices of a binary little-endian PLY,
+    """Write ``columns`` (n,), bytes and float64 as they are, all others as float32, as vertices of a binary little-endian PLY,
     and triangles ``faces`` (m, 3), numbers of vertices, atomically; returns its bytes."""
     n = len(next(iter(columns.values())))
     types = {name: {"u1": "u1", "f8": "<f8"}.get(c.dtype.str[1:], "<f4") for name, c in columns.items()}
