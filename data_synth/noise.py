@@ -6,6 +6,7 @@ three textures of the method once per seed and keeps them in the user's cache fo
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from pathlib import Path
@@ -160,7 +161,8 @@ def cloud_textures(seed: int = 0, base: int = 128) -> CloudTextures:
     folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "data_synth"
     path = folder / f"clouds-1-{seed}-{base}.npz"
     if path.exists():
-        with np.load(path) as stored:
+        # A damaged cache is made again: numpy and zlib raise whatever they like over one.
+        with contextlib.suppress(Exception), np.load(path) as stored:
             return CloudTextures(stored["base"], stored["detail"], stored["curl"])
     textures = make_textures(seed, base)
     try:

@@ -22,7 +22,12 @@ from data_synth.errors import InputError
 from data_synth.vdb_write import MAGIC, ZIP
 
 BLOSC = 4  # a bit of the compression flag
-LIMIT = 1 << 30  # voxels of a dense result; more is refused
+LIMIT = 1 << 30  # numbers of a dense result; more is refused
+FREE_LIMIT = 1 << 27
+"""Numbers of a dense result (512 MiB) that a file of any size may ask for: a few tiles are a fog of constant density."""
+LARGEST_RATIO = 1024
+"""Beyond, bytes of a dense result for each of the file: what deflate makes of zeros at most, and far more than clouds take
+(a few dozen). Two voxels far apart would fill any memory."""
 # per-node code of how inactive values are stored
 ONE_INACTIVE, MASK_NONE, MASK_ONE, MASK_TWO, ALL_VALUES = 2, 3, 4, 5, 6
 
@@ -96,7 +101,9 @@ def read_vdb(path: str | os.PathLike, name: str | None = None) -> VdbGrid:
     grids, others = {}, []
     for _ in range(r.number("I")):
         grid_name, kind, instance = r.string().split("\x1e")[0], r.string(), r.string()
-        position, _, end = (r.number("q") for _ in range(3))
+        position, block, end = (r.number("q") for _ in range(3))
+        if not r.at <= position <= block <= end <= len(r.data):  # else a grid could end where it begins, for ever
+            raise r.fail(f"the grid {grid_name} says it lies at bytes {position} to {end} of {len(r.data)}")
         vectors = kind.startswith("Tree_vec3s_5_4_3") and name == grid_name
         if (vectors or kind.startswith("Tree_float_5_4_3")) and not instance:
             grids.setdefault(grid_name, (position, kind.endswith("_HalfFloat"), 3 if vectors else 1))
@@ -234,8 +241,10 @@ class _Tree:
         if not low:
             raise self.r.fail("it has no active voxel")
         first, last = np.min(low, axis=0), np.max(high, axis=0)
-        if np.prod((last - first).astype(float)) > LIMIT:
-            raise self.r.fail(f"its extent {tuple(int(v) for v in last - first)} is too large to hold")
+        numbers = self.channels * float(np.prod((last - first).astype(float)))
+        if numbers > LIMIT or (numbers > FREE_LIMIT and 4 * numbers > LARGEST_RATIO * len(self.r.data)):
+            extent = "x".join(str(int(v)) for v in last - first)
+            raise self.r.fail(f"its voxels lie {extent} apart, {4 * numbers / 2**30:.1f} GiB as a dense grid")
         shape = tuple(last - first) + ((self.channels,) if self.channels > 1 else ())
         out = np.full(shape, self.background, np.float32)
 

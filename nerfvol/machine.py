@@ -43,7 +43,27 @@ def total_memory() -> int | None:
 
 
 def available_memory() -> int | None:
-    """Bytes that a new allocation can take without swapping; None where nobody tells."""
+    """Bytes that a new allocation can take without swapping, and within the process's own limit (``ulimit -v``); None where
+    nobody tells."""
+    found = [amount for amount in (_free_memory(), _address_space_left()) if amount is not None]
+    return min(found, default=None)
+
+
+def _address_space_left() -> int | None:
+    """Of a limit on this process's address space; None: there is none."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return None
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (ImportError, AttributeError, OSError, ValueError, IndexError):  # outside Linux
+        return None
+    return max(0, limit - used)
+
+
+def _free_memory() -> int | None:
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):

@@ -106,6 +106,12 @@ def run(options: ExportOptions) -> int:
     seconds = time.perf_counter() - started
     at = f" at level {written.level}" if row.levels and written.level is not None else ""
     print(f"{options.out}: {row.name}{at}, {written.size / 1e6:.1f} MB in {seconds:.1f} s; opened by {row.opened_by}")
+    if row.name == "splats" and target.model.kind == "splats":
+        from nerfvol.splats.ply import lost_digits
+        from nerfvol.views import SplatModel
+
+        if isinstance(target.model, SplatModel) and (said := lost_digits(target.model.splats)) is not None:
+            print(f"warning: {said}")
     return 0
 
 

@@ -89,29 +89,51 @@ def views_of(
         InputError: most pictures do not fit their calibration, or a lens does not reach them.
     """
     everything = {id(frame): frame for frame in (*training, *frames)}
-    headers = dict(
-        zip(everything, map_threads(lambda f: image_header(f.file), everything.values(), threads), strict=True)
-    )
+    found = dict(zip(everything, map_threads(_header, everything.values(), threads), strict=True))
+    headers = {key: header for key, header in found.items() if not isinstance(header, InputError)}
     made: dict[int, View] = {}
+    unread = {key: header for key, header in found.items() if isinstance(header, InputError)}
     wrong: dict[int, InputError] = {}
-    odd = _odd_sizes(everything, headers)
+    odd = _odd_sizes({key: everything[key] for key in headers}, headers)
     for key, frame in everything.items():
+        if key in unread:
+            continue
         try:
             if key in odd:
                 raise odd[key]
             made[key] = _view(frame, headers[key], source)
         except InputError as error:
             wrong[key] = error
-    if wrong and (len(wrong) > max(1, FEW * len(everything)) or len(everything) < 10):
-        raise next(iter(wrong.values()))
+    require_few([*unread.values(), *wrong.values()], len(everything))
+    if unread:
+        messages.append(unread_sentence(list(unread.values())))
     by_pose = _astray([made[id(f)] for f in training if id(f) in made], [made[id(f)] for f in frames if id(f) in made])
     own = [frame for frame in frames if id(frame) in made and id(made[id(frame)]) not in by_pose]
     if not own:
-        raise next(iter(wrong.values()), InputError(f"{source}: no images are left for this split"))
+        raise next(iter((unread | wrong).values()), InputError(f"{source}: no images are left for this split"))
     _tell(frames, headers, made, wrong, by_pose, messages)
     kept = [made[id(f)] for f in training if id(f) in made and id(made[id(f)]) not in by_pose]
     views = [made[id(frame)] for frame in own]
     return views, kept or views
+
+
+def require_few(wrong: Sequence[InputError], n: int) -> None:
+    """The first of the errors, raised where so many of ``n`` pictures may not be left out: a tenth of ten and more."""
+    if wrong and (len(wrong) > max(1, FEW * n) or n < 10):
+        raise wrong[0]
+
+
+def unread_sentence(errors: Sequence[InputError]) -> str:
+    """Of pictures that are left out because their files are damaged."""
+    rest = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    return f"{len(errors)} images cannot be read and are left out: {errors[0]}{rest}"
+
+
+def _header(frame: Frame) -> ImageHeader | InputError:
+    try:
+        return image_header(frame.file)
+    except InputError as error:
+        return error
 
 
 def with_circles(

@@ -15,7 +15,14 @@ from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.bounds import bounds_of_box, bounds_of_points, estimate_bounds, require_seen
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.formats import SPLITS, find_format
-from nerfvol.datasets.frames import View, views_of, with_circles, with_common_masks
+from nerfvol.datasets.frames import (
+    View,
+    require_few,
+    unread_sentence,
+    views_of,
+    with_circles,
+    with_common_masks,
+)
 from nerfvol.datasets.holdout import HOLDOUTS, hold_out_arc
 from nerfvol.datasets.images import (
     UInt8,
@@ -97,7 +104,12 @@ def load_dataset(
         made = map_threads(lambda view: _decoded(view, downscale, cut_out), views, threads)
         return _settle_alpha([image for image, _ in made], listing.source), [mask for _, mask in made]
 
-    images, masks = decode()
+    try:
+        images, masks = decode()
+    except InputError:  # found out which: once it is known that one is damaged, the time does not matter
+        views = _readable(views, messages, threads)
+        cameras = [view.camera.scaled(downscale) for view in views]
+        images, masks = decode()
     require_seen(bounds, cameras)
     messages += _on_masks(views, masks, images)
     store = ImageStore(len(images), lambda: decode()[0], images)
@@ -107,6 +119,24 @@ def load_dataset(
     return Dataset(
         cameras, store, names, bounds, source, messages, threads, listing.read_points, some, backdrop, decision.kind
     )
+
+
+def _readable(views: Sequence[View], messages: list[str], threads: int | None) -> list[View]:
+    """The views whose pictures are whole, where few are not; a sentence tells of the others."""
+
+    def damage(view: View) -> InputError | None:
+        try:
+            read_image(view.path)
+        except InputError as error:
+            return error
+        return None
+
+    found = map_threads(damage, views, threads)
+    wrong = [error for error in found if error is not None]
+    require_few(wrong, len(views))
+    if wrong:
+        messages.append(unread_sentence(wrong))
+    return [view for view, error in zip(views, found, strict=True) if error is None]
 
 
 def _scene_of(
@@ -130,8 +160,18 @@ def _scene_of(
 def _sample(views: Sequence[View], threads: int | None) -> list[tuple[View, UInt8]]:
     """A few training views with their pictures, small: what the kind of scene is judged by."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, MOST_JUDGED).round().astype(int))]
-    pictures = map_threads(lambda view: turned(read_small(view.path, JUDGED_SIZE), view.orientation), chosen, threads)
-    return list(zip(chosen, pictures, strict=True))
+
+    def small(view: View) -> UInt8 | InputError:
+        try:
+            return turned(read_small(view.path, JUDGED_SIZE), view.orientation)
+        except InputError as error:
+            return error
+
+    pictures = map_threads(small, chosen, threads)
+    wrong = [picture for picture in pictures if isinstance(picture, InputError)]
+    if len(wrong) == len(pictures):
+        raise wrong[0]
+    return [(v, p) for v, p in zip(chosen, pictures, strict=True) if not isinstance(p, InputError)]
 
 
 def _seen_small(view: View, picture: UInt8) -> NDArray[np.bool_] | None:

@@ -1,4 +1,5 @@
-"""``.ply`` of coloured points: x y z float32, scene units, red green blue bytes as in the training images.
+"""``.ply`` of coloured points: x y z in scene units, float32, or double where that would lose them (map coordinates), red green
+blue bytes as in the training images.
 
 ``surface``: what views of the model see, at the median depth of each pixel, one point a voxel, with normals; a point is
 kept where a second view agrees. ``centers``: of an octree the centres of leaves, of splats their means, each with the
@@ -28,6 +29,8 @@ Method = Literal["surface", "centers"]
 VIEWS = 40
 RESOLUTION = 512
 _OPAQUE = {"surface": 0.9, "centers": 0.5}
+_DIGITS = 1e-4
+"""Share of the model's size: where float32 rounds positions by more, they are doubles."""
 _AGREE = 2.0  # voxels between a point and the surface that another view sees
 
 
@@ -59,7 +62,10 @@ def write(
         cloud = _opaque(model, least)
     turn = turn_to(model, up)
     positions = cloud.positions @ turn.T
-    columns: dict[str, NDArray] = {name: positions[:, k].astype(np.float32) for k, name in enumerate("xyz")}
+    extent = float(np.ptp(positions, axis=0).max(initial=0.0))
+    rounding = float(np.spacing(np.float32(np.abs(positions).max(initial=0.0))))
+    kind = np.float64 if rounding > _DIGITS * extent > 0 else np.float32
+    columns: dict[str, NDArray] = {name: positions[:, k].astype(kind) for k, name in enumerate("xyz")}
     if cloud.normals is not None:
         normals = cloud.normals @ turn.T
         columns |= {name: normals[:, k].astype(np.float32) for k, name in enumerate(("nx", "ny", "nz"))}

@@ -61,6 +61,24 @@ def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
     return write_ply(path, [f"SplatRenderMode: {_WRITTEN[splats.mode]}"], columns)
 
 
+def lost_digits(splats: Splats) -> str | None:
+    """A sentence where the format's float32 positions are coarser than the splats themselves; None: they are not.
+
+    The layout has no double positions, and viewers read none: such splats are moved to near the origin before they are written.
+    """
+    far = float(np.abs(splats.origin).max())
+    rounding, width = (
+        float(np.spacing(np.float32(far))),
+        float(np.exp(np.median(splats.log_scales))) if splats.n else 1.0,
+    )
+    if rounding <= width:
+        return None
+    return (
+        f"the positions lie {far:.3g} from the origin, where the format's float32 is {rounding:.2g} coarse and a splat "
+        f"{width:.2g} wide: poses nearer to the origin keep them apart"
+    )
+
+
 def is_splat_ply(path: str | os.PathLike[str]) -> bool:
     """Whether the PLY file holds Gaussians (its vertices have scales), not mere points.
 

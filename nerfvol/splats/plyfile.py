@@ -188,11 +188,12 @@ class PlyFile:
 def write_ply(
     path: str | os.PathLike[str], comments: Sequence[str], columns: Mapping[str, NDArray], faces: NDArray | None = None
 ) -> int:
-    """Write ``columns`` (n,), bytes as they are and all others as float32, as the vertices of a binary little-endian PLY,
+    """Write ``columns`` (n,), bytes and float64 as they are, all others as float32, as vertices of a binary little-endian PLY,
     and triangles ``faces`` (m, 3), numbers of vertices, atomically; returns its bytes."""
     n = len(next(iter(columns.values())))
-    row = np.dtype([(name, "u1" if c.dtype == np.uint8 else "<f4") for name, c in columns.items()])
-    kinds = {name: "uchar" if c.dtype == np.uint8 else "float" for name, c in columns.items()}
+    types = {name: {"u1": "u1", "f8": "<f8"}.get(c.dtype.str[1:], "<f4") for name, c in columns.items()}
+    row = np.dtype(list(types.items()))
+    kinds = {name: {"u1": "uchar", "<f8": "double", "<f4": "float"}[t] for name, t in types.items()}
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     lines += [f"element vertex {n}", *(f"property {kind} {name}" for name, kind in kinds.items())]
     if faces is not None:

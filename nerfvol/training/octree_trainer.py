@@ -49,6 +49,9 @@ FINE_LEVEL = 9
 """From this level on a stage splits leaves once, and ..."""
 FINE_STEPS = 2500
 """... is left out where fewer steps would be left for it."""
+PRUNE_SHARE, FEWEST_PRUNE_STEPS = 0.05, 10
+"""Of the steps that a run will make, what comes before a pruning at most, and the fewest: a run that has no time for
+``prune_steps`` in each stage had better be rough in all of them than stay in the first."""
 BETA = 0.98
 """Memory, per step, of RMSprop's second moments."""
 FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
@@ -88,7 +91,7 @@ class OctreeTrainer:
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
-        self.steps_done = 0
+        self.steps_done, self._progress = 0, 0.0
         self.cursors = Cursors()
         self.prunings = 0
         self.tiles_seen = 0
@@ -188,7 +191,7 @@ class OctreeTrainer:
     def step(self, progress: float) -> ops.StepReport:
         """One step at ``progress`` in [0, 1] of the run."""
         c = self.config
-        progress = self._start + progress * (1 - self._start)
+        progress = self._progress = self._start + progress * (1 - self._start)
         if progress >= c.stage_ends[self.stage] and self.stage + 1 < len(c.levels):
             if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
                 self.next_stage()
@@ -287,13 +290,22 @@ class OctreeTrainer:
     def _worth_splitting(self, progress: float) -> bool:
         """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
         c, stage = self.config, self.stage + 1
-        left = self.steps_done * (1 - progress) / max(progress - self._start, 1e-9)
-        return left >= (FINE_STEPS if c.levels[stage] >= FINE_LEVEL else c.prunes[stage] * c.prune_steps)
+        left = self._steps_in_all() * (1 - progress)
+        return left >= (FINE_STEPS if c.levels[stage] >= FINE_LEVEL else c.prunes[stage] * self._prune_steps())
+
+    def _steps_in_all(self) -> float:
+        """Steps of a whole run at the pace so far; there is no pace before the first."""
+        made = self._progress - self._start
+        return self.steps_done / made if made > 0 else math.inf
+
+    def _prune_steps(self) -> float:
+        """Steps before a pruning: those set, fewer where the run is short."""
+        return min(self.config.prune_steps, max(FEWEST_PRUNE_STEPS, PRUNE_SHARE * self._steps_in_all()))
 
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
         enough = ENOUGH_TILES_OF_PHOTOGRAPHS if self.dataset.scene.is_unbounded else ENOUGH_TILES
-        if self.bank is None or self.tiles_seen < self.config.prune_steps * self.config.tiles[self.stage]:
+        if self.bank is None or self.tiles_seen < self._prune_steps() * self.config.tiles[self.stage]:
             return False
         return self.tiles_seen >= min(COVERAGE * len(self.bank.foreground_tiles), enough)
 

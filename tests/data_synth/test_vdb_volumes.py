@@ -320,3 +320,34 @@ def test_a_real_file_reads_exactly():
     with np.load(folder / "smoke_dense_f32.npz") as dense:
         assert np.array_equal(grid.values, dense["density"]) and np.array_equal(grid.first, dense["ijk_min"])
         assert np.allclose(grid.voxel_size, dense["voxel_size"])
+
+
+def test_voxels_far_apart_and_grids_that_end_before_they_begin(tmp_path):
+    """8 kB that ask for gigabytes are refused before any is taken, and so is a file that would be read for ever."""
+    far = np.array([[0, 0, 0], [900, 900, 900]])
+    write_grids(tmp_path / "far.vdb", [SparseGrid("density", far, np.ones(2, np.float32))])
+    with pytest.raises(InputError, match="901x901x901 apart, 2.7 GiB"):
+        read_vdb(tmp_path / "far.vdb")
+    whole = bytearray((tmp_path / "far.vdb").read_bytes())
+    at = whole.index(b"Tree_float_5_4_3") + 16 + 4 + 16
+    whole[at : at + 8] = struct.pack("<q", at - 60)
+    (tmp_path / "back.vdb").write_bytes(whole)
+    with pytest.raises(InputError, match="says it lies at bytes"):
+        read_vdb(tmp_path / "back.vdb")
+
+
+@pytest.mark.parametrize("make", [
+    lambda data: data[: len(data) // 2], lambda data: data[:90] + bytes(40) + data[130:], lambda data: b"",
+])  # fmt: skip
+def test_a_damaged_archive_is_one_sentence(tmp_path, make):
+    np.savez_compressed(tmp_path / "v.npz", density=np.random.default_rng(0).random((4, 5, 6)))
+    (tmp_path / "v.npz").write_bytes(make((tmp_path / "v.npz").read_bytes()))
+    with pytest.raises(InputError, match="v.npz: cannot be read as a numpy volume"):
+        read_volume(tmp_path / "v.npz")
+
+
+def test_an_array_called_an_archive(tmp_path):
+    with (tmp_path / "v.npz").open("wb") as file:
+        np.save(file, np.ones((3, 3, 3)))
+    with pytest.raises(InputError, match="it holds one array; such a file's name ends in .npy"):
+        read_volume(tmp_path / "v.npz")

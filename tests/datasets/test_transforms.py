@@ -283,6 +283,27 @@ def test_a_truncated_image_names_its_file(tmp_path):
         load_dataset(tmp_path)
 
 
+@pytest.mark.parametrize("kept", [5000, 20], ids=["body", "header"])
+def test_one_damaged_image_of_many_is_left_out_and_named(tmp_path, kept):
+    """A card that lost one file does not cost a set of twelve; two in twelve do, and so does one of nine."""
+    scenes.write_blender(tmp_path, scenes.ring(12), scenes.random_images(12, (60, 60)), splits=("train", "val"))
+    whole = load_dataset(tmp_path)
+    for name in ("view_004.png", "view_007.png"):
+        path = tmp_path / "train" / name
+        path.write_bytes(path.read_bytes()[:kept])
+        if name == "view_004.png":
+            dataset = load_dataset(tmp_path)
+            assert len(dataset) == len(dataset.images) == len(dataset.cameras) == 11
+            assert dataset.names == [n for n in whole.names if "view_004" not in n]
+            assert np.array_equal(dataset.cameras[4].c2w, whole.cameras[5].c2w)
+            (said,) = [m for m in dataset.messages if "cannot be read" in m]
+            assert said.startswith("1 images cannot be read and are left out") and "view_004.png" in said
+            dataset.images.release()
+            assert np.array_equal(dataset.images[4], whole.images[5])
+    with pytest.raises(InputError, match="view_00[47].png"):
+        load_dataset(tmp_path)
+
+
 def test_one_image_of_another_size(tmp_path):
     scenes.write_blender(tmp_path, scenes.ring(), scenes.random_images(), splits=("train", "val"))
     Image.new("RGB", (25, 16)).save(tmp_path / "train" / "view_004.png")

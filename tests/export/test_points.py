@@ -6,6 +6,8 @@ import pytest
 from nerfvol.errors import InputError
 from nerfvol.export import export_model
 from nerfvol.models import load_model
+from nerfvol.splats.ply import lost_digits
+from nerfvol.splats.plyfile import PlyFile
 from nerfvol.views import OctreeModel, SplatModel
 from tests.fixtures.tiny import TINY_RADIUS, sphere_colour
 from tests.splats.scenes import random_splats
@@ -38,6 +40,23 @@ def test_means_of_splats(tmp_path):
     assert np.allclose(points["place"], (splats.means + splats.origin)[shown], atol=1e-5)
     wanted = np.clip(0.5 + 0.28209479 * splats.sh[shown, :, 0], 0, 1)
     assert np.abs(points["colour"] / 255 - wanted).max() < 0.51 / 255
+
+
+@pytest.mark.parametrize("origin, kind", [((0, 0, 0), "float"), ((448_262.5, 5_411_932.25, 300), "double")])
+def test_map_coordinates_keep_their_digits(tmp_path, origin, kind):
+    """UTM northings are half a metre apart in float32; what is near the origin stays as viewers know it."""
+    splats = random_splats(200, 4, 3)
+    splats.origin = np.asarray(origin, float)
+    export_model(SplatModel(splats), tmp_path / "p.ply", "points", method="centers", threshold=0.6)
+    with PlyFile(tmp_path / "p.ply") as file:
+        columns = file.read()
+    assert f"property {kind} x".encode() in (tmp_path / "p.ply").read_bytes()[:400]
+    shown = 1 / (1 + np.exp(-splats.logits)) >= 0.6
+    places = np.stack([columns[name] for name in "xyz"], axis=1)
+    assert np.abs(places - (splats.means.astype(float) + splats.origin)[shown]).max() < 1e-5
+    assert len(load_model(tmp_path / "p.ply").cloud.positions) == shown.sum()
+    said = lost_digits(splats)
+    assert (said is None) == (kind == "float") and (said is None or "5.41e+06 from the origin" in said)
 
 
 def test_nothing_so_opaque(tmp_path):

@@ -1,6 +1,9 @@
 """Octree files: exact or within the codec's stated bounds, and nothing that bytes can say does more than be refused."""
 
 import json
+import os
+import subprocess
+import sys
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -414,3 +417,15 @@ def test_what_would_not_fit_into_memory_is_refused_before_it_is_made(tmp_path, m
     monkeypatch.setattr("nerfvol.machine.available_memory", lambda: 1000)
     with pytest.raises(InputError, match="GiB of memory"):
         load_octree(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits on address space are told by Linux")
+def test_a_limit_on_the_process_is_a_limit_on_memory():
+    """A batch system's ``ulimit -v``: what does not fit there is refused before it is tried."""
+    code = (
+        "import resource as r; hard = r.getrlimit(r.RLIMIT_AS)[1]; r.setrlimit(r.RLIMIT_AS, (1 << 29, hard))\n"
+        "from nerfvol.machine import available_memory; print(available_memory())"
+    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert 0 <= int(said.stdout) < 1 << 29

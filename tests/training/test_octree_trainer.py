@@ -21,15 +21,29 @@ from nerfvol.views import render_image
 def test_nothing_is_pruned_before_it_could_become_visible(tiny_scene):
     """A low-density start needs steps: however few the tiles and however short the stage, pruning waits for them."""
     config = OctreeConfig(
-        levels=[4, 5], downscales=[4, 2], stage_ends=[0.001, 1.0], tiles=[4, 4], prunes=[1, 1], prune_steps=12
+        levels=[4, 5], downscales=[4, 2], stage_ends=[0.001, 1.0], tiles=[4, 4], prunes=[1, 1], prune_steps=8
     )
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
     leaves = tuner.octree.n_leaves
-    for _ in range(12):
+    for _ in range(8):
         tuner.step(0.5)
         assert tuner.octree.n_leaves == leaves and tuner.stage == 0
     tuner.step(0.5)
     assert tuner.prunings == 1 and tuner.octree.n_leaves < leaves
+
+
+@pytest.mark.parametrize("steps, waits", [(60, 10), (300, 15), (4000, 20)])
+def test_a_short_run_comes_to_its_finest_stage(tiny_scene, steps, waits):
+    """Where a machine is slow, a time budget holds few steps: each stage then has a pruning after fewer of them."""
+    config = OctreeConfig(
+        levels=[4, 5, 5], downscales=[4, 2, 1], stage_ends=[0.1, 0.3, 1.0], tiles=[4, 4, 4], prunes=[1, 1, 1],
+        prune_steps=20,
+    )  # fmt: skip
+    tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
+    for step in range(60):
+        tuner.step(step / steps)
+    assert tuner._prune_steps() == pytest.approx(waits, rel=0.02)
+    assert tuner.stage == (2 if steps == 60 else 1 if steps == 300 else 0)
 
 
 def test_splitting_stays_within_the_memory(tiny_scene, capsys):
@@ -172,9 +186,9 @@ def test_a_run_has_the_settings_of_its_scene(tiny_scene):
         assert trainer.octree.sh_degree == degree
 
 
-@pytest.mark.parametrize("progress, begins", [(0.5, False), (0.3, True)])
+@pytest.mark.parametrize("progress, begins", [(0.7, False), (0.3, True)])
 def test_a_coarse_stage_needs_steps_for_its_prunings(tiny_scene, monkeypatch, progress, begins):
-    """Two prunings take 40 steps: 30 in half of a run leave 30, in three tenths 70."""
+    """Two prunings of a short run take 20 steps: 30 in seven tenths of it leave 12, in three tenths 70."""
     monkeypatch.setattr(octree_trainer, "COVERAGE", 0)
     config = OctreeConfig(levels=[3, 4], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 2])
     steps_taken(monkeypatch)
