@@ -53,15 +53,36 @@ NEAREST = 0.05
 """Sample to a camera among photographs, in units of half the inner cube's edge."""
 
 
+def compiled_refusal(config: FieldConfig) -> str | None:
+    """Why the compiled kernels do not train a field so; None: they do."""
+    if config.trainer == "torch":
+        return "field.trainer is torch"
+    if config.sampler != "occupancy":
+        return f"field.sampler is {config.sampler}"
+    if config.sparsity_weight > 0:
+        return "field.sparsity_weight is not 0"
+    return field_ops.refusal(config.shape)
+
+
 def make_field_trainer(
     dataset: Dataset, config: FieldConfig, seed: int = 0, background: Sequence[float] = (1.0, 1.0, 1.0)
 ) -> FieldTrainer | CompiledFieldTrainer:
-    """The trainer of a field: by the compiled kernels where they can, else in torch; arguments as of both."""
-    refused = field_ops.refusal(config.shape) is not None or config.sampler != "occupancy" or config.sparsity_weight > 0
-    if refused or config.trainer == "torch":
+    """The trainer of a field that an octree is made of: by the compiled kernels where they can, else in torch; arguments as of
+    both."""
+    if compiled_refusal(config) is not None:
         return FieldTrainer(dataset, config, seed, background)
     domain = domain_of(dataset.scene)
     return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain))
+
+
+def make_final_trainer(
+    dataset: Dataset, config: FieldConfig, seed: int, background: Sequence[float]
+) -> CompiledFieldTrainer:
+    """The trainer of a field that is the product; InputError where the kernels, which draw it later, cannot train it."""
+    if (refused := compiled_refusal(config)) is not None:
+        raise InputError(f"--representation field trains by the compiled kernels alone: {refused}")
+    domain = domain_of(dataset.scene)
+    return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain), final=True)
 
 
 def near_plane_of(domain: Domain) -> float:
