@@ -186,11 +186,11 @@ def fitting_factor(width: int, height: int) -> int:
 
 def small_picture(
     dataset: Dataset, i: int, picture: Callable[[Camera], NDArray[np.floating]]
-) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]:
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[Any]]:
     """What Seen says of view ``i``, where ``picture`` draws the model."""
     camera, image = dataset.cameras[i], dataset.images[i]
     k = fitting_factor(camera.intrinsics.width, camera.intrinsics.height)
     small = area_average(image, k).astype(np.float32) / 255
     shown = picture(camera.scaled(k))
     weight = small[..., 3] > OPAQUE if small.shape[2] == 4 else np.ones(shown.shape[:2])
-    return small[..., :3], shown, weight.astype(np.float32)
+    return small[..., :3], shown, weight

@@ -58,6 +58,17 @@ def _key(seed: int, step: int) -> int:
     return key
 
 
+def compiled_refusal(config: FieldConfig) -> str | None:
+    """Why the compiled kernels do not train a field so; None: they do."""
+    if config.trainer == "torch":
+        return "field.trainer is torch"
+    if config.sampler != "occupancy":
+        return f"field.sampler is {config.sampler}"
+    if config.sparsity_weight > 0:
+        return "field.sparsity_weight is not 0"
+    return field_ops.refusal(config.shape)
+
+
 class Pixels:
     """All training pixels of one image scale, to draw rays from: uint8 pictures and shared tables of pixel directions."""
 

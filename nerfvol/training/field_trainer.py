@@ -20,9 +20,8 @@ from nerfvol.field.fields import NeuralField, RadianceField, make_field
 from nerfvol.field.layout import Domain
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
-from nerfvol.kernels import field_ops
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
-from nerfvol.training.compiled_field import CompiledFieldTrainer
+from nerfvol.training.compiled_field import CompiledFieldTrainer, compiled_refusal
 from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
 if TYPE_CHECKING:
@@ -51,17 +50,6 @@ MOST_RAYS = 8192
 """Of one step, while most of space is known to be empty."""
 NEAREST = 0.05
 """Sample to a camera among photographs, in units of half the inner cube's edge."""
-
-
-def compiled_refusal(config: FieldConfig) -> str | None:
-    """Why the compiled kernels do not train a field so; None: they do."""
-    if config.trainer == "torch":
-        return "field.trainer is torch"
-    if config.sampler != "occupancy":
-        return f"field.sampler is {config.sampler}"
-    if config.sparsity_weight > 0:
-        return "field.sparsity_weight is not 0"
-    return field_ops.refusal(config.shape)
 
 
 def make_field_trainer(

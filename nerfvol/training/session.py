@@ -31,6 +31,7 @@ from nerfvol.machine import process_seconds, return_free_memory
 from nerfvol.measure.metrics import ssim
 from nerfvol.models import Model
 from nerfvol.neural import FieldModel
+from nerfvol.training.compiled_field import compiled_refusal
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder
 from nerfvol.views import OctreeModel, SplatModel
@@ -110,7 +111,9 @@ class Run:
         self.given = config
         sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in data.training.cameras)
         scene = data.training.scene
-        suited = config.for_views(len(data.training), scene).for_scene(scene).for_pictures(sides[len(sides) // 2])
+        if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
+            config = config.for_views(len(data.training), scene)
+        suited = config.for_scene(scene).for_pictures(sides[len(sides) // 2])
         self.config = suited.before(data.training.backdrop)
         self.background: tuple[float, float, float] = self.config.background or WHITE
         self.data, self.clock, self.say = data, clock, say
