@@ -61,6 +61,7 @@ class Model(Protocol):
 FORMATS = {
     "nerfvol octree": "nerfvol.views:OctreeModel.load",
     "nerfvol splats": "nerfvol.views:SplatModel.load",
+    "nerfvol field": "nerfvol.neural:FieldModel.load",
 }
 """The ``format`` key of a file's document, and what opens it."""
 SUFFIXES = {
@@ -71,8 +72,8 @@ SUFFIXES = {
 
 
 def load_model(target: str | os.PathLike[str]) -> Model:
-    """The model in a run folder or a file: our own octrees and splats, also in a page (.html), Gaussians or points in a .ply,
-    Gaussians in a .spz, a PlenOctree in an .npz.
+    """The model in a run folder or a file: our own octrees, splats and fields, the first two also in a page (.html),
+    Gaussians or points in a .ply, Gaussians in a .spz, a PlenOctree in an .npz.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.

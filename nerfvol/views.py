@@ -65,7 +65,7 @@ def render_image(
         for name in ("depth", "median_depth"):
             if name in out:
                 out[name] *= np.float32(scale)
-    return _beyond_reach(out, lens, background)
+    return beyond_reach(out, lens, background)
 
 
 def _near_origin(octree: Octree, camera: Camera) -> tuple[Octree, NDArray[np.float64], float]:
@@ -85,7 +85,7 @@ def _near_origin(octree: Octree, camera: Camera) -> tuple[Octree, NDArray[np.flo
     return near, pose, scale
 
 
-def _beyond_reach(out: dict[str, Float], lens: Intrinsics, background: Sequence[float]) -> dict[str, Float]:
+def beyond_reach(out: dict[str, Float], lens: Intrinsics, background: Sequence[float]) -> dict[str, Float]:
     """The picture with background, and nothing of anything else, where the lens does not reach."""
     seen = lens.seen()
     if seen is not None:
@@ -285,7 +285,7 @@ class SplatModel:
             view = view_of(seen, self.packed.origin, max(self.near, self._nearest(seen)))
             return operator(self.packed, view, colour, early_stop_eps, outputs)
 
-        return _beyond_reach(through_lens(pinhole, camera), camera.intrinsics, colour)
+        return beyond_reach(through_lens(pinhole, camera), camera.intrinsics, colour)
 
     def aabb(self) -> NDArray[np.float64]:
         """(2, 3) corners of the box around the middle 98 % of the means, three deviations wide: few lie far out."""

@@ -58,7 +58,7 @@ def test_type_checkers_see_the_same_names():
 
 # ---------------------------------------------------------------- train
 def test_train_by_keywords(tiny_scene, tmp_path):
-    run = nerfvol.train(data=tiny_scene, out=tmp_path / "run", octree=FEW, storage="float32")
+    run = nerfvol.train(data=tiny_scene, out=tmp_path / "run", init="direct", octree=FEW, storage="float32")
     octree, metadata = load_octree(run / "octree.safetensors")
     assert run == tmp_path / "run" and octree.n_leaves > 0
     assert metadata["provenance"]["steps"] == {"octree": 12}

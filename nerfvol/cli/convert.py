@@ -1,4 +1,4 @@
-"""``nerfvol convert``: an octree from splats, or splats from an octree, and what that costs."""
+"""``nerfvol convert``: an octree from splats or a field, splats from an octree or a field, and what that costs."""
 
 from __future__ import annotations
 
@@ -71,7 +71,8 @@ def run(options: ConvertOptions) -> int:
     target = open_target(options.target, options.background)
     if target.model.kind == options.to:
         raise InputError(
-            f"{target.path} holds {options.to} already; convert makes an octree of splats or splats of an octree"
+            f"{target.path} holds {options.to} already; convert makes an octree of splats or a field, or splats "
+            "of an octree or a field"
         )
     prepare_outputs(file=options.out)
     set_threads(options.threads)
@@ -105,6 +106,7 @@ def _images_of(options: ConvertOptions) -> tuple[str | None, int]:
 def _converted(options: ConvertOptions, target: Target, training: Dataset | None) -> Model:
     from nerfvol.clouds import PointModel
     from nerfvol.config.training import Config
+    from nerfvol.neural import FieldModel
     from nerfvol.training import convert
     from nerfvol.views import OctreeModel, SplatModel
 
@@ -117,14 +119,21 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
     metadata = {k: v for k, v in model.metadata.items() if k in ("orbit", "provenance")} | {
         "background": list(background)
     }
-    if options.to == "splats" and not isinstance(model, OctreeModel):
-        raise InputError(f"{target.path} holds {model.kind}, and splats are made of an octree alone")
+    if options.to == "splats" and not isinstance(model, OctreeModel | FieldModel):
+        raise InputError(f"{target.path} holds {model.kind}, and splats are made of an octree or a field alone")
     seen = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, SplatModel | PointModel):
         octree = convert.octree_of(model.splats, seen, background, options.level, options.seed)
         if training is not None and options.time_budget is not None:
             octree = convert.tuned_octree(octree, training, background, config)
         return OctreeModel(octree, metadata)
+    if isinstance(model, FieldModel):
+        octree = convert.octree_of_field(model, seen, background, options.level)
+        if options.to == "octree":
+            if training is not None and options.time_budget is not None:
+                octree = convert.tuned_octree(octree, training, background, config)
+            return OctreeModel(octree, metadata)
+        model = OctreeModel(octree, metadata)
     assert isinstance(model, OctreeModel)
     splats = convert.splats_of(model.octree, seen, background, options.max_splats or convert.MOST_SPLATS)
     if training is None or options.time_budget is None:
@@ -159,7 +168,7 @@ def _say_cost(target: Target, model: Model, held_out: Dataset | None) -> None:
 
 
 COMMAND = Command(
-    summary="Make an octree of splats, or splats of an octree.",
+    summary="Make an octree of splats or a field, or splats of an octree or a field.",
     example="nerfvol convert run --to octree --out octree.safetensors\nnerfvol convert run --to splats --out scene.ply",
     options=ConvertOptions,
     arguments=arguments,

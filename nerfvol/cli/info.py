@@ -67,7 +67,7 @@ def _print(record: dict[str, Any]) -> None:
         print(f"by resolution   {levels}")
         print(f"filled          {100 * stats['filled_share']:.3g} % of the root cube")
         print(f"density         {file['density']}, scale {file['density_scale']:g}")
-    for kind in ("splats", "points"):
+    for kind in ("splats", "points", "field"):
         for key, value in record.get(kind, {}).items():
             print(f"{key.replace('_', ' '):15s} {f'{value:,}' if type(value) is int else json.dumps(value)}")
     print(f"nerfvol         {record['nerfvol']}")
@@ -84,7 +84,8 @@ def _print_file(file: dict[str, Any]) -> None:
     print(
         f"format          {file['format']} {file['version']}, written by nerfvol {file.get('nerfvol', '(no version)')}"
     )
-    print(f"colour          {file['colour']}, SH degree {file['sh_degree']}")
+    if "colour" in file:
+        print(f"colour          {file['colour']}, SH degree {file['sh_degree']}")
     for key, value in file["metadata"].items():
         print(f"{key:15s} {json.dumps(value)}")
 

@@ -25,11 +25,13 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
                    "previews/, checkpoint.safetensors")  # fmt: skip
     p.add_argument("--config", metavar="FILE", help="YAML file of settings, such as configs/smoke.yaml")
-    p.add_argument("--representation", metavar="auto|octree|splats", help="auto: splats on photographs, which they draw "
-                   "sharper and sooner; the octree, which has a density, on objects and media (default: auto)")  # fmt: skip
+    p.add_argument("--representation", metavar="auto|octree|splats|field", help="auto: splats on photographs, which they draw "
+                   "sharper and sooner; the octree, which has a density, on objects and media; field: a "
+                   "small network behind a hash grid, which the others can be made of (default: auto)")  # fmt: skip
     p.add_argument("--init", metavar="START", help="where it starts. octree: direct (low density everywhere) or mlp (a small "
-                   "field, trained first and distilled); splats: points (of a COLMAP model), sweep (of planes through the "
-                   "photographs), points+sweep, random, or a file of splats or an octree (default: auto)")  # fmt: skip
+                   "field, trained first and distilled, which auto takes for objects of few views); splats: points (of a "
+                   "COLMAP model), sweep (of planes through the photographs), points+sweep, "
+                   "random, or a file of splats or an octree (default: auto)")  # fmt: skip
     p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "
                    "a fixed number of steps, the same result every time (default: none)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B from 0 to 1: what images with alpha "

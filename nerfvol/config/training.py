@@ -145,7 +145,9 @@ class FieldConfig(Checked):
     few_views: Annotated[int, at_least(0)] = 16
     """... and with so many training pictures or fewer that is what matters most: then it is ..."""
     few_decay: Weight = 1e-4
-    """... this, and colours do not depend on the direction."""
+    """... this, colours do not depend on the direction, ..."""
+    few_entropy: Weight = 0.01
+    """... and the entropy of a ray's opacity has this weight."""
     sparsity_weight: Weight = 0.0
     """Weight of mean(1 - exp(-sigma * step)) at random points: clears space that nothing constrains. Trains in torch."""
     bfloat16: bool = True
@@ -322,6 +324,8 @@ BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error"
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
                "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
 """Settings of an octree where nothing else is said."""
+FEW_VIEWS = {"tv_density": 3e-4, "tv_sh": 3e-4, "tv_from": 0}
+"""... and of an object that few views show, which begins as a field (docs/experiments.md)."""
 
 
 @dataclass(frozen=True)
@@ -357,13 +361,14 @@ class Config(Checked):
     """Folder (or transforms JSON) of posed images."""
     out: str = ""
     """Run folder."""
-    representation: Literal["auto", "octree", "splats"] = "auto"
+    representation: Literal["auto", "octree", "splats", "field"] = "auto"
     """What is trained. auto: splats on photographs, which are sharper and sooner so; the octree, which has a density, on
-    objects with a transparent background and on media."""
+    objects with a transparent background and on media. A field is a small network behind a hash grid."""
     init: str = "auto"
-    """Where it starts. An octree: "mlp", a small field that is trained and distilled, or "direct", low density everywhere
-    (auto). Splats: "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "random", or a
-    file or run of splats or of an octree (auto: what there is)."""
+    """Where it starts. An octree: "mlp", a small field that is trained and distilled (auto: of objects with few training
+    views), or "direct", low density everywhere (auto: of all else). A field: auto. Splats: "points" of a COLMAP model, "sweep"
+    of planes through the photographs, "points+sweep", "random", or a file or run of splats or of an octree (auto: what there
+    is)."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     scene: Literal["auto", "object", "surroundings", "room", "forward"] = "auto"
@@ -410,24 +415,36 @@ class Config(Checked):
         """Raises InputError where ``init`` is no start of the representation; a resumed run needs its file no more."""
         if self.resume:
             return
-        known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS}
+        known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS, "field": ()}
         names = known.get(self.representation, OCTREE_STARTS + SPLAT_STARTS)
-        is_file = self.representation != "octree" and Path(self.init).exists()
+        is_file = self.representation not in ("octree", "field") and Path(self.init).exists()
         if self.init != "auto" and self.init not in names and not is_file:
             of = "" if self.representation == "auto" else f" for {self.representation}"
-            or_file = "" if self.representation == "octree" else " or a file of splats or an octree"
-            raise InputError(f"init: expected auto, {', '.join(names)}{or_file}{of}, got {self.init!r}")
+            or_file = "" if self.representation in ("octree", "field") else " or a file of splats or an octree"
+            raise InputError(f"init: expected {', '.join(('auto', *names))}{or_file}{of}, got {self.init!r}")
 
     def for_scene(self, scene: SceneBounds) -> Config:
         """The same with a number for each setting that the kind of scene decides."""
         octree = self.octree.for_scene(scene)
         distill = filled(self.distill, {"sh_degree": octree.sh_degree}).for_scene(scene)
         sections = {"octree": octree, "distill": distill, "splats": self.splats.for_scene(scene)}
-        chosen = self.representation
-        if chosen == "auto":
-            named = "octree" if self.init in OCTREE_STARTS else "auto" if self.init == "auto" else "splats"
-            chosen = ("splats" if scene.is_unbounded else "octree") if named == "auto" else named
-        return dataclasses.replace(self, **sections, representation=chosen)
+        return dataclasses.replace(self, **sections, representation=self._suited(scene))
+
+    def _suited(self, scene: SceneBounds) -> Literal["octree", "splats", "field"]:
+        """The representation as asked for, or the one that suits the start or the scene."""
+        if self.representation != "auto":
+            return self.representation
+        if self.init == "auto":
+            return "splats" if scene.is_unbounded else "octree"
+        return "octree" if self.init in OCTREE_STARTS else "splats"
+
+    def for_views(self, n: int, scene: SceneBounds) -> Config:
+        """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
+        few views show a field leaves less open than low density does (docs/experiments.md)."""
+        few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
+        if not few or self.init not in ("auto", "mlp"):
+            return self
+        return dataclasses.replace(self, init="mlp", octree=filled(self.octree, FEW_VIEWS))
 
     def for_pictures(self, side: int) -> Config:
         """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""

@@ -55,7 +55,7 @@ EXPORTS: tuple[Export, ...] = (
     ),
     Export("vdb", (".vdb",), "nerfvol.export.vdb", ("octree",), "Blender, Houdini", ("full_float", "srgb"), levels=True),
     Export(
-        "grid", (".npz", ".npy", ".nii", ".nii.gz", ".vti"), "nerfvol.export.grid", ("octree",),
+        "grid", (".npz", ".npy", ".nii", ".nii.gz", ".vti"), "nerfvol.export.grid", ("octree", "field"),
         "numpy; 3D Slicer, napari, Niivue (.nii); ParaView (.vti)", ("resolution", "quantity"),
     ),
     Export("plenoctree", (".npz",), "nerfvol.export.plenoctree", ("octree",), "svox, volrend", levels=True),

@@ -1,8 +1,8 @@
-"""An octree on a dense grid: ``.npz .npy`` (numpy), ``.nii .nii.gz`` (NIfTI-1), ``.vti`` (VTK image data).
+"""An octree or a field on a dense grid: ``.npz .npy`` (numpy), ``.nii .nii.gz`` (NIfTI-1), ``.vti`` (VTK image data).
 
-Samples are at the centres of cubic voxels of the box around the leaves: density, the opacity of a voxel along its side, or
-colour (the mean over directions, as in the training images; bytes in NIfTI and VTK, which have no other colours). Axes are
-the scene's.
+Samples are at the centres of cubic voxels of the box around the leaves or occupied cells: density, the opacity of a voxel
+along its side, or colour (the mean over directions, as in the training images; bytes in NIfTI and VTK, which have no other
+colours). Axes are the scene's.
 
 - ``.npz``: ``density`` (``opacity``, ``color``), index order x, y, z, with ``lo``, ``hi`` and ``voxel_size`` (3,), as the
   density.npz of a synthetic scene; next to an ``.npy`` lies a .json of the same name that says the same.
@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write, write_json
 from nerfvol.models import Model
+from nerfvol.neural import FieldModel
 from nerfvol.octree.points import octree_colour, octree_density
-from nerfvol.octree.tree import Octree
 from nerfvol.views import OctreeModel
 
+_Sampled = OctreeModel | FieldModel
 Quantity = Literal["sigma", "opacity", "color"]
 RESOLUTION = 256
 LARGEST = 2048
@@ -69,26 +70,34 @@ def write(
     model: Model, path: str | os.PathLike[str], resolution: int = RESOLUTION, quantity: Quantity = "sigma"
 ) -> int:
     """The grid with ``resolution`` voxels along the longest side of the leaves' box."""
-    assert isinstance(model, OctreeModel)
+    assert isinstance(model, OctreeModel | FieldModel)
     grid = _Grid(model, resolution)
     ending = next(ending for ending in _WRITERS if Path(path).name.lower().endswith(ending))
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        _WRITERS[ending](file, model.octree, grid, quantity)
+        _WRITERS[ending](file, model, grid, quantity)
     if ending == ".npy":
         box = {"lo": grid.lo.tolist(), "hi": grid.hi.tolist(), "voxel_size": [grid.voxel] * 3}
         write_json(Path(path).with_suffix(".json"), {"quantity": quantity, **box})
     return Path(path).stat().st_size
 
 
-def _runs(octree: Octree, grid: _Grid, quantity: Quantity, order: Literal["C", "F"]) -> Iterator[NDArray[np.float32]]:
+def _runs(model: _Sampled, grid: _Grid, quantity: Quantity, order: Literal["C", "F"]) -> Iterator[NDArray[np.float32]]:
     """The samples (n,) or (n, 3), run by run."""
     for at in range(0, int(np.prod(grid.shape)), _RUN):
         places = grid.places(at, _RUN, order)
         if quantity == "color":
-            yield np.clip(octree_colour(octree, places), 0, 1).astype(np.float32)
+            yield np.clip(_colour(model, places), 0, 1).astype(np.float32)
             continue
-        sigma = octree_density(octree, places)
+        sigma = _density(model, places)
         yield (sigma if quantity == "sigma" else -np.expm1(-sigma * grid.voxel)).astype(np.float32)
+
+
+def _density(model: _Sampled, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    return octree_density(model.octree, places) if isinstance(model, OctreeModel) else model.density(places)
+
+
+def _colour(model: _Sampled, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    return octree_colour(model.octree, places) if isinstance(model, OctreeModel) else model.colour(places)
 
 
 def _numbers(runs: Iterator[NDArray[np.float32]], quantity: Quantity) -> Iterator[bytes]:
@@ -97,35 +106,35 @@ def _numbers(runs: Iterator[NDArray[np.float32]], quantity: Quantity) -> Iterato
         yield (np.rint(255 * run).astype(np.uint8) if quantity == "color" else run.astype("<f4")).tobytes()
 
 
-def _write_npz(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) -> None:
-    values = _whole(octree, grid, quantity)
+def _write_npz(file: BinaryIO, model: _Sampled, grid: _Grid, quantity: Quantity) -> None:
+    values = _whole(model, grid, quantity)
     box = {"lo": grid.lo, "hi": grid.hi, "voxel_size": np.full(3, grid.voxel)}
     np.savez_compressed(file, **{_NAMES[quantity]: values, **box})
 
 
-def _write_npy(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) -> None:
-    np.save(file, _whole(octree, grid, quantity))
+def _write_npy(file: BinaryIO, model: _Sampled, grid: _Grid, quantity: Quantity) -> None:
+    np.save(file, _whole(model, grid, quantity))
 
 
-def _whole(octree: Octree, grid: _Grid, quantity: Quantity) -> NDArray[np.float32]:
+def _whole(model: _Sampled, grid: _Grid, quantity: Quantity) -> NDArray[np.float32]:
     channels = (3,) if quantity == "color" else ()
     values = np.empty((*grid.shape, *channels), np.float32)
     flat, at = values.reshape(-1, *channels), 0
-    for run in _runs(octree, grid, quantity, "C"):
+    for run in _runs(model, grid, quantity, "C"):
         flat[at : at + len(run)] = run
         at += len(run)
     return values
 
 
-def _write_nifti(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) -> None:
+def _write_nifti(file: BinaryIO, model: _Sampled, grid: _Grid, quantity: Quantity) -> None:
     file.write(_nifti_header(grid, quantity))
-    for part in _numbers(_runs(octree, grid, quantity, "F"), quantity):
+    for part in _numbers(_runs(model, grid, quantity, "F"), quantity):
         file.write(part)
 
 
-def _write_nifti_gz(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) -> None:
+def _write_nifti_gz(file: BinaryIO, model: _Sampled, grid: _Grid, quantity: Quantity) -> None:
     with gzip.GzipFile(filename="", mode="wb", fileobj=file, compresslevel=6, mtime=0) as packed:
-        _write_nifti(packed, octree, grid, quantity)  # type: ignore[arg-type]
+        _write_nifti(packed, model, grid, quantity)  # type: ignore[arg-type]
 
 
 def _nifti_header(grid: _Grid, quantity: Quantity) -> bytes:
@@ -148,7 +157,7 @@ def _nifti_header(grid: _Grid, quantity: Quantity) -> bytes:
     return bytes(header)
 
 
-def _write_vti(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) -> None:
+def _write_vti(file: BinaryIO, model: _Sampled, grid: _Grid, quantity: Quantity) -> None:
     extent = " ".join(f"0 {n - 1}" for n in grid.shape)
     triple = lambda values: " ".join(repr(float(v)) for v in values)  # noqa: E731
     kind, channels, size = ("UInt8", 3, 1) if quantity == "color" else ("Float32", 1, 4)
@@ -167,11 +176,11 @@ def _write_vti(file: BinaryIO, octree: Octree, grid: _Grid, quantity: Quantity) 
 _""".encode()
     )
     file.write(struct.pack("<Q", int(np.prod(grid.shape, dtype=object)) * channels * size))
-    for part in _numbers(_runs(octree, grid, quantity, "F"), quantity):
+    for part in _numbers(_runs(model, grid, quantity, "F"), quantity):
         file.write(part)
     file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-_WRITERS: dict[str, Callable[[BinaryIO, Octree, _Grid, Quantity], None]] = {
+_WRITERS: dict[str, Callable[[BinaryIO, _Sampled, _Grid, Quantity], None]] = {
     ".npz": _write_npz, ".npy": _write_npy, ".nii.gz": _write_nifti_gz, ".nii": _write_nifti, ".vti": _write_vti,
 }  # fmt: skip

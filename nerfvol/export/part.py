@@ -48,7 +48,8 @@ def _cropped(model: Model, box: NDArray[np.float64]) -> Model:
     if isinstance(model, SplatModel):
         splats = model.splats
         return SplatModel(splats.select(inside(splats.means.astype(np.float64) + splats.origin)), model.metadata)
-    assert isinstance(model, PointModel)
+    if not isinstance(model, PointModel):
+        raise InputError(f"--crop is for octrees, splats and points, this is a model of {model.kind}")
     cropped = PointModel(model.cloud[inside(model.cloud.positions)], model.metadata)
     cropped.composite = model.composite
     return cropped

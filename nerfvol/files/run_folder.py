@@ -10,7 +10,8 @@ from nerfvol.errors import InputError
 CONFIG = "config.yaml"
 OCTREE = "octree.safetensors"
 SPLATS = "splats.safetensors"
-PRODUCTS = (OCTREE, SPLATS)
+FIELD = "field.safetensors"
+PRODUCTS = (OCTREE, SPLATS, FIELD)
 """Models that a finished run may hold."""
 CHECKPOINT = "checkpoint.safetensors"
 DISTILLED = "distilled.safetensors"

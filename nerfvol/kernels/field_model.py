@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
 
 
+EARLY_STOP = 1e-3
+"""Transmittance below which a ray ends, in training and where a picture is not asked for more exactly."""
+
+
 class CompiledField:
     """A field that is empty where its occupancy grid says so, as it was in training; the protocol of ``SHField`` and more.
 
@@ -29,10 +33,22 @@ class CompiledField:
 
     def picture(self, camera: Camera) -> np.ndarray:
         """(height, width, 3) float32 as ``camera`` sees it, clipped to [0, 1]."""
+        return self.render(camera, self.background)["rgb"].clip(0, 1)
+
+    def render(
+        self,
+        camera: Camera,
+        background: Sequence[float],
+        outputs: Sequence[str] = ("rgb",),
+        early_stop_eps: float = EARLY_STOP,
+    ) -> dict[str, Float]:
+        """One view, see field_ops.render_rays: float32 (H, W, 3) or (H, W) for each of ``outputs``; rgb is not clipped."""
         origin, directions = camera.rays()
+        directions = directions.reshape(-1, 3)
         origins = np.broadcast_to(np.asarray(origin, np.float32), directions.shape)
-        out = field_ops.render_rays(self.state, origins, directions, self.march, self.background, outputs=("rgb",))
-        return out["rgb"].clip(0, 1).reshape(camera.intrinsics.height, camera.intrinsics.width, 3)
+        out = field_ops.render_rays(self.state, origins, directions, self.march, background, early_stop_eps, outputs)
+        size = camera.intrinsics.height, camera.intrinsics.width
+        return {name: array.reshape(*size, *array.shape[1:]) for name, array in out.items()}
 
     def evaluate(self, positions: Float, values: bool = True) -> tuple[Float, Float | None]:
         """sigma (n,) in 1/u at scene positions (n, 3) and, with ``values``, SH coefficients (n, 3, K); numpy arrays.

@@ -181,6 +181,23 @@ class Occupancy:
         self.occupied = np.full(-(-cells // 64), ~np.uint64(0))
         self.coarse = np.full(-(-(cells // COARSE**3) // 64), ~np.uint64(0))
 
+    @classmethod
+    def of_bits(cls, domain: Domain, resolution: int, occupied: NDArray[np.uint64]) -> Occupancy:
+        """The grid whose bits are ``occupied``, to draw with: it remembers no coefficients.
+
+        Raises ValueError where there are more or fewer bits than cells.
+        """
+        out = cls(domain, resolution)
+        if occupied.shape != out.occupied.shape:
+            raise ValueError(f"occupancy: expected {out.occupied.shape} words of bits, got {occupied.shape}")
+        compiled = native()
+        assert compiled is not None
+        out.sigmas[...] = np.unpackbits(occupied.view(np.uint8), bitorder="little")[: len(out.sigmas)]
+        limits = np.full(out.cubes, 0.5, np.float32)
+        compiled.field_refresh(out.sigmas, limits, resolution, out.occupied, out.coarse)
+        out.sigmas[...] = 0
+        return out
+
     def refresh(self, most: float = 0.02) -> None:
         """Derive the bits: a cell is occupied while its optical thickness is above ``most`` and above half the mean of all."""
         compiled = native()

@@ -9,6 +9,7 @@ import numpy as np
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.tiles import TileBank
 from nerfvol.kernels import ops
+from nerfvol.octree.rows import explin
 from nerfvol.octree.tree import Octree
 
 JUDGED_PIXELS = 200
@@ -18,6 +19,8 @@ JUDGED_DOWNSCALE = 4
 ENOUGH_VIEWS = 20
 """Views that have a place in their picture before they can tell that nothing there is needed: what fewer see is often seen by
 another view alone."""
+SOLID = 0.2
+"""Opacity from which a leaf of a given octree stays, whatever fewer views need."""
 JUDGING_VIEWS = 50
 """Views that are asked, evenly chosen: of 100 views of an object the other half changed nothing."""
 _BLOCK = 3  # levels above a leaf: the middle of so large a cell stands for its leaves, for pictures change slowly
@@ -37,6 +40,12 @@ def needed(octree: Octree, dataset: Dataset, background: Sequence[float], weight
     if weight <= 0 or not judged.any():
         return np.ones(octree.n_leaves, bool)
     return ~judged | (largest_weights(octree, dataset, background, judged_downscale(dataset)) >= weight)
+
+
+def solid(octree: Octree) -> np.ndarray:
+    """(n_leaves,) bool: leaves as opaque as SOLID along their side, at their densest corner."""
+    densest = octree.density_scale * explin(octree.density[octree.corners].max(1))
+    return -np.expm1(-densest * octree.leaf_sizes()) >= SOLID
 
 
 def views_of_leaves(octree: Octree, dataset: Dataset) -> np.ndarray:

@@ -16,7 +16,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.datasets.images import UInt8
+from nerfvol.cameras.camera import Camera
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import UInt8, area_average
 from nerfvol.measure.colour_fit import IDENTITY, SATURATED, apply_map, compose, exposure, fit_colour_map, inverse
 
 MOMENTS = (0.05, 0.1, 0.16, 0.23, 0.33, 0.45, 0.6, 0.8)
@@ -35,6 +37,8 @@ BRIGHTER = 1.02
 FITTED_WIDTH = 60
 """Pixels along the longer side that a picture has at least when its map is fitted."""
 LARGEST_FACTOR = 8
+OPAQUE = 0.999
+"""Pixels with transparency whose colour is the thing's alone: these have a colour map fitted."""
 Mode = Literal["auto", "on", "off"]
 
 Seen = Callable[[int], tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]]
@@ -178,3 +182,15 @@ def fitting_factor(width: int, height: int) -> int:
     while factor > 1 and max(width, height) / factor < FITTED_WIDTH:
         factor //= 2
     return factor
+
+
+def small_picture(
+    dataset: Dataset, i: int, picture: Callable[[Camera], NDArray[np.floating]]
+) -> tuple[NDArray[np.floating], NDArray[np.floating], NDArray[Any]]:
+    """What Seen says of view ``i``, where ``picture`` draws the model."""
+    camera, image = dataset.cameras[i], dataset.images[i]
+    k = fitting_factor(camera.intrinsics.width, camera.intrinsics.height)
+    small = area_average(image, k).astype(np.float32) / 255
+    shown = picture(camera.scaled(k))
+    weight = small[..., 3] > OPAQUE if small.shape[2] == 4 else np.ones(shown.shape[:2])
+    return small[..., :3], shown, weight

@@ -20,6 +20,8 @@ from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_model import CompiledField
 from nerfvol.kernels.field_ops import FieldBatch, FieldLoss, FieldRates, FieldState, March, Occupancy
 from nerfvol.native import native
+from nerfvol.neural import FieldModel
+from nerfvol.training.appearance import Appearance, small_picture
 from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
 if TYPE_CHECKING:
@@ -39,6 +41,8 @@ SLOW_LEVELS, SLOW_EVERY = 3, 2
 NETWORK_DECAY = 1e-6
 EPS = 1e-6
 """Of Adam: entries that only samples of no weight were in hardly move, which 1e-15 would send a full step at random."""
+SECONDS_TO_WRITE = 0.3
+"""Of a field that is the product."""
 WARM_UP = 20
 """Steps over which the rate rises."""
 
@@ -52,6 +56,17 @@ def _key(seed: int, step: int) -> int:
         key = (key ^ key >> 27) * 0x94D049BB133111EB % 2**64
         key ^= key >> 31
     return key
+
+
+def compiled_refusal(config: FieldConfig) -> str | None:
+    """Why the compiled kernels do not train a field so; None: they do."""
+    if config.trainer == "torch":
+        return "field.trainer is torch"
+    if config.sampler != "occupancy":
+        return f"field.sampler is {config.sampler}"
+    if config.sparsity_weight > 0:
+        return "field.sparsity_weight is not 0"
+    return field_ops.refusal(config.shape)
 
 
 class Pixels:
@@ -89,6 +104,7 @@ class CompiledFieldTrainer:
         seed: all randomness.
         background: RGB that images with alpha are composited on and that lies behind the field.
         near_plane: nothing nearer to a camera is looked at, u.
+        final: the field is what the run is for; else an octree follows, which is made of it.
     """
 
     name = "field"
@@ -106,7 +122,9 @@ class CompiledFieldTrainer:
         seed: int = 0,
         background: Sequence[float] = (1.0, 1.0, 1.0),
         near_plane: float = 0.0,
+        final: bool = False,
     ) -> None:
+        self.final, self.appearance = final, Appearance(len(dataset), "off")
         self.dataset, self.seed, self.domain = dataset, seed, domain
         self.few = len(dataset) <= config.few_views
         shape = dataclasses.replace(config.shape, sh_degree=0) if self.few else config.shape
@@ -131,20 +149,20 @@ class CompiledFieldTrainer:
         return self.state.nbytes
 
     def share_of(self, seconds: float) -> float:
-        """``field.time_budget``, and at most FIELD_SHARE: an octree must follow."""
-        return min(self.config.time_budget, FIELD_SHARE * seconds)
+        """All of them, or, where an octree follows, ``field.time_budget`` and at most FIELD_SHARE."""
+        return seconds if self.final else min(self.config.time_budget, FIELD_SHARE * seconds)
 
     def size(self) -> str:
         """See Phase."""
         return f"{self.n_rays} rays"
 
     def seconds_to_write(self) -> float:
-        """Distilling comes first."""
-        return SECONDS_TO_DISTILL
+        """Distilling comes first, where an octree follows."""
+        return SECONDS_TO_WRITE if self.final else SECONDS_TO_DISTILL
 
     def needs_images(self) -> bool:
-        """The octree will."""
-        return True
+        """Until the pixels at hand serve to the end; an octree will ask for them."""
+        return not (self.final and len(set(self.config.downscales)) == 1 and self._pixels)
 
     def outgrown(self) -> str | None:
         """A field does not grow."""
@@ -157,6 +175,14 @@ class CompiledFieldTrainer:
     def trained_field(self) -> CompiledField:
         """The field without what it holds in space that training skips: what is to be rendered or distilled."""
         return CompiledField(self.state, self.march, self.background)
+
+    def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See FinalPhase."""
+        return small_picture(self.dataset, i, self.picture)
+
+    def take_model(self, metadata: dict[str, Any]) -> FieldModel:
+        """The field as it is; Adam's moments stay behind with the trainer."""
+        return FieldModel(self.trained_field(), metadata)
 
     # ------------------------------------------------------------------ training
     def step(self, progress: float | None = None) -> FieldReport:
@@ -184,7 +210,7 @@ class CompiledFieldTrainer:
 
     def _loss(self, progress: float) -> FieldLoss:
         config, fading = self.config, 0.1**progress
-        entropy = config.entropy_weight
+        entropy = config.few_entropy if self.few else config.entropy_weight
         return FieldLoss(self.background, fading * config.colour_weight, fading * config.distortion_weight, entropy)
 
     def _rates(self, progress: float) -> FieldRates:

@@ -1,4 +1,5 @@
-"""One representation from another: splats become an octree, an octree splats, and what that cost is measured.
+"""One representation from another: splats or a field become an octree, an octree or a field splats, and what that cost is
+measured.
 
 Geometry first (starts/leaves.py, starts/surfels.py), from the model alone. An octree of splats is then fitted to pictures of
 them, since Gaussians that overlap are no sum of densities: no photograph is needed for it. Either may be trained further on
@@ -16,15 +17,18 @@ from typing import cast
 import numpy as np
 
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
-from nerfvol.config.training import Config, OctreeConfig
+from nerfvol.config.training import Config, DistillConfig, OctreeConfig
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.measure.scores import evaluate
 from nerfvol.models import Model
+from nerfvol.neural import FieldModel
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds, cube
 from nerfvol.splats.splats import Splats
+from nerfvol.starts.field import distill
 from nerfvol.starts.leaves import PIXELS, octree_around
 from nerfvol.starts.subject import subject_of
 from nerfvol.starts.surfels import surfels
@@ -116,6 +120,24 @@ def octree_of(
     for step in range(FITTED_STEPS):
         trainer.step(step / FITTED_STEPS)
     return trainer.octree
+
+
+def octree_of_field(
+    model: FieldModel, seen: Dataset, background: Sequence[float], level: int | None = None, say: Say = print
+) -> Octree:
+    """The octree that a field is distilled to (starts/field.py); ``seen``: pictures of it, which say what is visible.
+
+    level: of the finest leaves, along the inner cube; None: as in training.
+
+    Raises:
+        InputError: the field is empty, or nothing of it is seen.
+    """
+    frame = Frame(model.origin, model.scale)
+    config = DistillConfig(level=level)
+    octree, report = distill(model.field, model.domain, frame.dataset_into(seen), background, config)
+    for message in report.messages:
+        say(message)
+    return frame.octree_back(octree)
 
 
 def splats_of(octree: Octree, seen: Dataset, background: Sequence[float], most: int | None = None) -> Splats:

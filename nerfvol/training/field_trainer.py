@@ -20,9 +20,8 @@ from nerfvol.field.fields import NeuralField, RadianceField, make_field
 from nerfvol.field.layout import Domain
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
-from nerfvol.kernels import field_ops
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
-from nerfvol.training.compiled_field import CompiledFieldTrainer
+from nerfvol.training.compiled_field import CompiledFieldTrainer, compiled_refusal
 from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
 if TYPE_CHECKING:
@@ -56,12 +55,22 @@ NEAREST = 0.05
 def make_field_trainer(
     dataset: Dataset, config: FieldConfig, seed: int = 0, background: Sequence[float] = (1.0, 1.0, 1.0)
 ) -> FieldTrainer | CompiledFieldTrainer:
-    """The trainer of a field: by the compiled kernels where they can, else in torch; arguments as of both."""
-    refused = field_ops.refusal(config.shape) is not None or config.sampler != "occupancy" or config.sparsity_weight > 0
-    if refused or config.trainer == "torch":
+    """The trainer of a field that an octree is made of: by the compiled kernels where they can, else in torch; arguments as of
+    both."""
+    if compiled_refusal(config) is not None:
         return FieldTrainer(dataset, config, seed, background)
     domain = domain_of(dataset.scene)
     return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain))
+
+
+def make_final_trainer(
+    dataset: Dataset, config: FieldConfig, seed: int, background: Sequence[float]
+) -> CompiledFieldTrainer:
+    """The trainer of a field that is the product; InputError where the kernels, which draw it later, cannot train it."""
+    if (refused := compiled_refusal(config)) is not None:
+        raise InputError(f"--representation field trains by the compiled kernels alone: {refused}")
+    domain = domain_of(dataset.scene)
+    return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain), final=True)
 
 
 def near_plane_of(domain: Domain) -> float:

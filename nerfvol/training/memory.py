@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfvol.config.splats import SplatConfig
-from nerfvol.config.training import Config
+from nerfvol.config.training import Config, FieldConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs, estimate_bytes
 from nerfvol.datasets.tiles import foreground_share
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
+from nerfvol.field.layout import layers_of
 from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
 from nerfvol.octree.rows import BLOCKS
@@ -226,6 +227,18 @@ def splat_memory(photographs: Photographs, schedule: Schedule, config: SplatConf
             "(--set splats.max_splats=N)"
         )
     return sentence
+
+
+def field_memory(dataset: Dataset, config: FieldConfig, held_out_bytes: int) -> str:
+    """The estimate of training a field that is the product, in words."""
+    shape = config.shape
+    pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
+    images = dataset.nbytes + 3 * pixels // min(config.downscales) ** 2 + held_out_bytes
+    entries = shape.hash_levels * shape.hash_features << shape.hash_log2_table if shape.encoding == "hash" else 0
+    network = sum(layer.numbers for layer in layers_of(shape))
+    field = 4 * 4 * (entries + network) + 4 * config.grid_resolution**3 * (1 + dataset.scene.n_shells)
+    peak = BASE_BYTES + images + field
+    return f"{gib(peak)} at its peak: images {gib(images)}, the field {gib(field)}, the program {gib(BASE_BYTES)}"
 
 
 class OctreePlan:

@@ -17,7 +17,6 @@ import numpy as np
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import OctreeConfig, SceneChoices
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import area_average
 from nerfvol.datasets.store import Corrected
 from nerfvol.datasets.tiles import Cursors, TileBank
 from nerfvol.errors import InputError
@@ -28,7 +27,8 @@ from nerfvol.octree.topology import Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 from nerfvol.starts.fog import low_density_octree
-from nerfvol.training.appearance import Appearance, fitting_factor
+from nerfvol.starts.visible import ENOUGH_VIEWS, solid
+from nerfvol.training.appearance import Appearance, small_picture
 from nerfvol.training.memory import OctreePlan, splits_within
 from nerfvol.views import OctreeModel, render_image
 
@@ -56,8 +56,6 @@ BETA = 0.98
 """Memory, per step, of RMSprop's second moments."""
 FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
 """At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
-OPAQUE = 0.999
-"""Pixels with transparency whose colour is the thing's alone: these have a colour map fitted."""
 FINAL_TILES = 4096
 """Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
 
@@ -91,6 +89,7 @@ class OctreeTrainer:
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
+        self.keeps_solid = octree is not None and len(dataset) < ENOUGH_VIEWS
         self.steps_done, self._progress = 0, 0.0
         self.cursors = Cursors()
         self.prunings = 0
@@ -158,7 +157,7 @@ class OctreeTrainer:
             "origin": t.origin, "size": t.size, "density_scale": t.density_scale, "sh_degree": t.sh_degree,
             "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
             "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
-            "prunings": self.prunings, "tiles_seen": self.tiles_seen,
+            "keeps_solid": self.keeps_solid, "prunings": self.prunings, "tiles_seen": self.tiles_seen,
             "cursors": dataclasses.asdict(self.cursors), "appearance": self.appearance.state_dict(),
         }  # fmt: skip
 
@@ -183,6 +182,7 @@ class OctreeTrainer:
             setattr(self.state, name, np.array(state[name], dtype=np.float32))
         for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
             setattr(self, name, int(state[name]))
+        self.keeps_solid = bool(state.get("keeps_solid", False))
         self.cursors = Cursors.of(state["cursors"])
         self.appearance.load_state_dict(state["appearance"])
         # The bank says when enough was seen to prune: where there was one, there must be one at once.
@@ -244,12 +244,7 @@ class OctreeTrainer:
 
     def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See FinalPhase."""
-        camera, image = self.dataset.cameras[i], self.dataset.images[i]
-        k = fitting_factor(camera.intrinsics.width, camera.intrinsics.height)
-        small = area_average(image, k).astype(np.float32) / 255
-        shown = self.picture(camera.scaled(k))
-        weight = small[..., 3] > OPAQUE if small.shape[2] == 4 else np.ones(shown.shape[:2])
-        return small[..., :3], shown, weight
+        return small_picture(self.dataset, i, self.picture)
 
     def next_stage(self) -> None:
         """Prunes, splits the leaves that the next stage wants finer, and turns to its images."""
@@ -330,9 +325,12 @@ class OctreeTrainer:
         """Which leaves have a largest weight of at least ``weight``, (n_leaves,).
 
         And those that no ray has met, until two epochs of tiles were seen, so that each was for certain: what is seen at the
-        rim of a few pictures would be lost for good. They cost no time, and are split no more.
+        rim of a few pictures would be lost for good. They cost no time, and are split no more. And, of a given octree whose
+        views are too few to judge it (starts/visible.py), all that is solid.
         """
         needed = self.state.max_weight >= weight
+        if self.keeps_solid:
+            needed |= solid(self.octree)
         if self.bank is not None and self.config.foreground_share * self.tiles_seen < 2 * len(
             self.bank.foreground_tiles
         ):

@@ -30,6 +30,8 @@ from nerfvol.kernels.state import StepReport
 from nerfvol.machine import process_seconds, return_free_memory
 from nerfvol.measure.metrics import ssim
 from nerfvol.models import Model
+from nerfvol.neural import FieldModel
+from nerfvol.training.compiled_field import compiled_refusal
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder
 from nerfvol.views import OctreeModel, SplatModel
@@ -108,7 +110,10 @@ class Run:
     ) -> None:
         self.given = config
         sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in data.training.cameras)
-        suited = config.for_scene(data.training.scene).for_pictures(sides[len(sides) // 2])
+        scene = data.training.scene
+        if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
+            config = config.for_views(len(data.training), scene)
+        suited = config.for_scene(scene).for_pictures(sides[len(sides) // 2])
         self.config = suited.before(data.training.backdrop)
         self.background: tuple[float, float, float] = self.config.background or WHITE
         self.data, self.clock, self.say = data, clock, say
@@ -316,6 +321,8 @@ class Run:
         frame = self.data.frame
         if isinstance(model, OctreeModel):
             return OctreeModel(frame.octree_back(model.octree), model.metadata)
+        if isinstance(model, FieldModel):
+            return FieldModel(model.field, model.metadata, frame.shift, frame.scale)
         if frame.is_identity or not isinstance(model, SplatModel):
             return model
         return SplatModel(frame.splats_back(model.splats), {**model.metadata, "near": model.near * frame.scale})

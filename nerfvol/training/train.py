@@ -1,4 +1,4 @@
-"""The training run, from top to bottom: data, (field, distillation,) octree, scores.
+"""The training run, from top to bottom: data, (field, distillation,) octree, or splats, or a field alone, scores.
 
 Without a time budget a run is a fixed number of steps and no clock is read for anything but the log and the moments of
 checkpoints: the same seed gives the same bits, for any number of threads, stopped and resumed or not. With a budget,
@@ -36,7 +36,8 @@ from nerfvol.measure.scores import COLOUR_MAPS, evaluate, score_views
 from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
 from nerfvol.training.appearance import Appearance
-from nerfvol.training.memory import OctreePlan, splat_memory
+from nerfvol.training.compiled_field import CompiledFieldTrainer
+from nerfvol.training.memory import OctreePlan, field_memory, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
@@ -45,7 +46,7 @@ from nerfvol.training.session import Clock, Run, Say, Watch, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
-PRODUCT = {"octree": run_folder.OCTREE, "splats": run_folder.SPLATS}
+PRODUCT = {"octree": run_folder.OCTREE, "splats": run_folder.SPLATS, "field": run_folder.FIELD}
 WHY = {
     "octree": "an object without surroundings, or asked for by --init",
     "splats": "photographs, which splats draw sharper and sooner, or asked for by --init",
@@ -117,7 +118,8 @@ def _train(
     run = Run(config, data, clock, saved, say)
     run.watch = watch
     with run.interruptible(), run:
-        phase: FinalPhase = begin_splats(run) if run.config.representation == "splats" else begin_octree(run)
+        begin = {"octree": begin_octree, "splats": begin_splats, "field": begin_field}
+        phase: FinalPhase = begin[run.config.representation](run)
         optimise(run, phase, bar)
         appearance = phase.appearance
         if data.training.scene.is_unbounded:
@@ -136,8 +138,21 @@ def begin_octree(run: Run) -> OctreeTrainer:
     config, data = run.config, run.data
     plan = OctreePlan(config, data.training, data.held_out_bytes)
     announce(run, plan.sentence())
+    if config.init != run.given.init:
+        run.say(f"start: a field, then the octree that it is distilled to, for there are only {len(data.training)} training "
+                "views; --init direct overrules")  # fmt: skip
     octree = start_from_field(run) if config.init == "mlp" and run.phase in ("start", "field") else None
     return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan, appearance_of(run))
+
+
+def begin_field(run: Run) -> CompiledFieldTrainer:
+    """The trainer of a field that is the product itself."""
+    from nerfvol.training.field_trainer import make_final_trainer
+
+    config, dataset = run.config, run.data.training
+    announce(run, field_memory(dataset, config.field, run.data.held_out_bytes))
+    ops.set_threads(ops.get_threads())  # torch was loaded only now
+    return make_final_trainer(dataset, config.field, config.seed, run.background)
 
 
 def begin_splats(run: Run) -> SplatTrainer:
@@ -274,7 +289,7 @@ def finish(run: Run, trained: list[Model]) -> Results:
 def _counts(model: Model) -> dict[str, int]:
     """What the model is made of, by name."""
     described = model.describe()
-    return {name: described[name] for name in ("leaves", "vertices", "splats") if name in described}
+    return {name: described[name] for name in ("leaves", "vertices", "splats", "parameters") if name in described}
 
 
 def progress_bar(name: str, done: float) -> tqdm[Any]:

@@ -124,6 +124,7 @@ def test_rays_are_the_cameras_and_colours_the_images(compiled, dataset: Dataset)
 def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:
     trainer = trainer_of(dataset, dataclasses.replace(SMALL, few_views=8))
     assert trainer.state.shape.sh_degree == 0 and trainer._rates(0.0).table_decay == SMALL.few_decay
+    assert trainer._loss(0.5).entropy == SMALL.few_entropy > trainer_of(dataset)._loss(0.5).entropy == 0
     assert trainer_of(dataset).state.shape.sh_degree == 1
 
 

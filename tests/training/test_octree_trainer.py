@@ -10,7 +10,7 @@ from nerfvol.config.training import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.load import load_dataset
 from nerfvol.kernels import ops
-from nerfvol.octree.rows import DENSITY_SLOT
+from nerfvol.octree.rows import DENSITY_SLOT, explin_inverse
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
 from nerfvol.training import octree_trainer
@@ -318,6 +318,30 @@ def test_what_no_ray_has_met_yet_is_kept(tiny_scene):
     tuner.tiles_seen = 2 * epoch
     tuner.prune()
     assert np.array_equal(tuner.octree.query(centers) >= 0, third != 1) and tuner.tiles_seen == 0
+
+
+@pytest.mark.parametrize("views, keeps", [(12, True), (20, False)])
+def test_few_views_do_not_judge_what_is_solid_in_a_given_octree(tiny_scene, sphere_octree, views, keeps):
+    """The inside of a ball that no ray needs stays; haze goes, and with views enough all of it; resumed alike."""
+    dataset = load_dataset(tiny_scene, "train")
+    numbers = [i % 12 for i in range(views)]
+    dataset = dataclasses.replace(dataset, cameras=[dataset.cameras[i] for i in numbers], names=[str(i) for i in range(views)],
+                                  images=[dataset.images[i] for i in numbers])  # fmt: skip
+    config = OctreeConfig(levels=[5], downscales=[1], stage_ends=[1.0], tiles=[16], prunes=[1], prune_steps=1)
+    trainer = OctreeTrainer(dataset, (1, 1, 1), config, 0, sphere_octree)
+    trainer.step(0.0)
+    octree = trainer.octree
+    side, third = octree.leaf_sizes()[0], np.arange(octree.n_leaves) % 3 == 0
+    corners = np.zeros(octree.n_vertices, bool)
+    corners[octree.corners[third].reshape(-1)] = True
+    # Opacity 1 - exp(-0.3) = 0.26 along a side where it is solid, 1e-5 where it is haze.
+    octree.density[:] = explin_inverse(np.where(corners, 0.3, 1e-5) / side / octree.density_scale)
+    trainer.state.max_weight[:], trainer.state.footprint[:] = 0.0, 1.0
+    solid = corners[octree.corners].any(1)
+    assert 0.3 < solid.mean() and np.array_equal(trainer._needed(0.005), solid & keeps)
+    again = OctreeTrainer(dataset, (1, 1, 1), config, 0, None)
+    again.load_state_dict(trainer.state_dict())
+    assert again.keeps_solid == keeps and not OctreeTrainer(dataset, (1, 1, 1), config).keeps_solid
 
 
 def test_the_last_pruning_keeps_what_no_ray_has_met_yet(tiny_scene):

@@ -17,7 +17,7 @@ import nerfvol
 from nerfvol.cameras.camera import Intrinsics
 from nerfvol.cli.command import set_threads
 from nerfvol.config.assemble import assemble
-from nerfvol.config.training import Config
+from nerfvol.config.training import Config, OctreeConfig
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
@@ -276,6 +276,22 @@ def test_which_representation_suits(alpha, init, expected):
     assert Config(init=init).for_scene(scene).representation == expected
     for asked in ("octree", "splats") if init == "auto" else ():
         assert Config(init=init, representation=asked).for_scene(scene).representation == asked
+
+
+@pytest.mark.parametrize("views, alpha, given, start, tv", [
+    (16, True, {}, "mlp", 3e-4), (17, True, {}, "auto", 6e-5), (16, False, {}, "auto", None),
+    (8, True, {"init": "direct"}, "direct", 6e-5), (8, True, {"init": "mlp"}, "mlp", 3e-4),
+    (8, True, {"representation": "splats"}, "auto", 6e-5), (8, True, {"representation": "field"}, "auto", 6e-5),
+    (8, True, {"octree": OctreeConfig(tv_sh=0.5)}, "mlp", None),
+])  # fmt: skip
+def test_objects_of_few_views_begin_as_fields(views, alpha, given, start, tv):
+    """Where nobody says otherwise; what somebody chose stays."""
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    scene = SceneBounds(box, None if alpha else 16 * box, alpha)
+    config = Config(**given).for_views(views, scene).for_scene(scene)
+    assert config.init == start
+    assert tv is None or config.octree.tv_sh == config.octree.tv_density == tv
+    assert "octree" not in given or (config.octree.tv_sh, config.octree.tv_density) == (0.5, 3e-4)
 
 
 # ---------------------------------------------------------------- where it starts
