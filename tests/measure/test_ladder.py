@@ -13,7 +13,7 @@ from tests.fixtures.runs import TINY
 @pytest.fixture
 def settings(tmp_path):
     octree = {key: value for key, value in TINY["octree"].items() if key != "steps"}
-    (tmp_path / "settings.yaml").write_text(yaml.safe_dump({"octree": octree}))
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump({"octree": octree, "field": {"few_views": 0}}))
     return tmp_path / "settings.yaml"
 
 
