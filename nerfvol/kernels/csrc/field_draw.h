@@ -11,7 +11,7 @@ inline void render_field(const FieldShape& f, const FieldParameters& given, cons
     const Network net(f, given.network, false);
     const Marcher marcher(f, march);
     nerfvol::Arenas arenas;
-    std::vector<std::unique_ptr<Chunk>> of_thread(std::size_t(nerfvol::get_threads()));
+    std::vector<std::unique_ptr<Chunk>> of_thread(static_cast<std::size_t>(nerfvol::get_threads()));
     nerfvol::parallel_for(int((rays.n + kRays - 1) / kRays), [&](int task, int thread) {
         auto& chunk = of_thread[std::size_t(thread)];
         if (!chunk) chunk = std::make_unique<Chunk>(net, given, marcher, arenas.of_thread(thread), false);
@@ -99,7 +99,7 @@ inline void evaluate_field(const FieldShape& f, const FieldParameters& given, co
     const Network net(f, given.network, false);
     std::unique_ptr<Marcher> marcher;
     if (points.where) marcher = std::make_unique<Marcher>(f, *points.where);
-    std::vector<std::unique_ptr<Evaluator>> of_thread(std::size_t(nerfvol::get_threads()));
+    std::vector<std::unique_ptr<Evaluator>> of_thread(static_cast<std::size_t>(nerfvol::get_threads()));
     const int count = f.sh_head ? 3 * f.coefficients() : 3;
     nerfvol::parallel_for(int((points.n + kPoints - 1) / kPoints), [&](int task, int thread) {
         auto& evaluator = of_thread[std::size_t(thread)];

@@ -87,7 +87,7 @@ struct FieldStep {
         counts_.resize(2 * chunks);
         const int64_t floats = Layers::sums_floats(f);
         sums_.assign(std::size_t(kGroups), nullptr);
-        std::vector<std::unique_ptr<Chunk>> of_thread(std::size_t(nerfvol::get_threads()));
+        std::vector<std::unique_ptr<Chunk>> of_thread(static_cast<std::size_t>(nerfvol::get_threads()));
         nerfvol::parallel_for(kGroups, [&](int g, int thread) {
             auto& chunk = of_thread[std::size_t(thread)];
             if (!chunk) chunk = std::make_unique<Chunk>(net, FieldParameters{memory.table, memory.network}, marcher, arenas.of_thread(thread), true);
