@@ -114,7 +114,9 @@ def ladder_figure(record: Mapping[str, Any]) -> Any:
         place.xaxis.set_minor_formatter("")
         place.grid(True, which="both", alpha=0.25)
     figure.legend(*axes[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=3)
-    figure.suptitle(f"{Path(record['data']).name}: {record['hardware']['cpu']}, {record['threads']} threads", fontsize=10)
+    figure.suptitle(
+        f"{Path(record['data']).name}: {record['hardware']['cpu']}, {record['threads']} threads", fontsize=10
+    )
     return figure
 
 
