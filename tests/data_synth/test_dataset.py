@@ -23,6 +23,7 @@ from data_synth import (
     write_dataset,
 )
 from data_synth.cli import main
+from data_synth.dataset import render_view
 from data_synth.image import Picture, linear_to_srgb, read_exr, srgb_to_linear, write_exr
 from data_synth.scenes.showcase import Showcase, edge_pixels
 
@@ -186,6 +187,21 @@ def test_a_set_that_was_stopped_goes_on_and_never_stands_beside_another_ones_tra
     kept = (out / "train" / "r_0.png").stat().st_mtime_ns
     assert main([*SLAB, "--seed", "5", "--out", str(out)]) == 0
     assert _set(out) == _set(whole) and (out / "train" / "r_0.png").stat().st_mtime_ns == kept
+
+
+def test_every_view_has_a_seed_of_its_own_whoever_renders_it(tmp_path, monkeypatch):
+    seen = {}
+
+    def watched(scene, camera, integrator=None, seed=0):
+        seen.setdefault(camera.c2w.tobytes(), []).append(seed)
+        return render_view(scene, camera, integrator, seed)
+
+    monkeypatch.setattr("data_synth.dataset.render_view", watched)
+    write_dataset(scenes.slab(), tmp_path / "all", Options(3, (4, 4), seed=2))
+    write_dataset(scenes.slab(), tmp_path / "some", Options(3, (4, 4), seed=2, chosen=(1, 5, 2)))
+    seeds = list(seen.values())
+    assert len({seed for row in seeds for seed in row}) == len(seeds) == 6
+    assert sorted(len(row) for row in seeds) == [1, 1, 1, 2, 2, 2] and all(len(set(row)) == 1 for row in seeds)
 
 
 @pytest.mark.parametrize(
