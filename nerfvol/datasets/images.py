@@ -7,6 +7,8 @@ colour premultiplied by alpha, summed exactly in integers and rounded once.
 from __future__ import annotations
 
 import contextlib
+import os
+import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from nerfvol.cameras.warp import reduce
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
 from nerfvol.machine import usable_cores
@@ -112,9 +115,30 @@ class ImageHeader:
 def image_header(path: Path) -> ImageHeader:
     """What the file's header says, without decoding; InputError where it is no image, damaged or too large."""
     with _opened(path) as image:
-        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+        orientation = _exif(image, path).get(_EXIF_ORIENTATION, 1)
         known = type(orientation) is int and 1 <= orientation <= 8
         return ImageHeader(image.size, orientation if known else 1)
+
+
+def _exif(image: Image.Image, path: Path) -> Image.Exif:
+    """The file's EXIF data. Pillow decodes a whole PNG to look for it behind the pixels: only where something is there."""
+    if image.format == "PNG" and not _something_follows_pixels(path):
+        return Image.Image.getexif(image)
+    return image.getexif()
+
+
+def _something_follows_pixels(path: Path) -> bool:
+    """Whether a PNG file has chunks between its pixels' last and its end."""
+    with path.open("rb") as file:
+        file.seek(len(b"\x89PNG\r\n\x1a\n"))
+        pixels = False
+        while len(head := file.read(8)) == 8:
+            length, name = struct.unpack(">I4s", head)
+            if pixels and name != b"IDAT":
+                return name != b"IEND"
+            pixels = name == b"IDAT"
+            file.seek(length + 4, os.SEEK_CUR)
+    return False
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -139,8 +163,18 @@ def read_image(path: Path, orientation: int = 1) -> UInt8:
     Raises:
         InputError: there is no such image, it is damaged, has 32 bits a channel or more than MAX_PIXELS.
     """
+    return writeable(read_pixels(path, orientation))
+
+
+def read_pixels(path: Path, orientation: int = 1) -> UInt8:
+    """As :func:`read_image`, but the array may refuse writing: what is averaged next need not be copied."""
     with _opened(path) as image:
         return turned(_pixels(image, path), orientation)
+
+
+def writeable(image: UInt8) -> UInt8:
+    """The image, or a copy where it refuses writing."""
+    return image if image.flags.writeable else image.copy()
 
 
 def read_small(path: Path, size: int) -> UInt8:
@@ -184,7 +218,7 @@ def _pixels(image: Image.Image, path: Path) -> UInt8:
         raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32-bit pixels (mode {image.mode})")
     has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
     wanted = "RGBA" if has_alpha else "RGB"
-    return np.array(image if image.mode == wanted else image.convert(wanted))
+    return np.asarray(image if image.mode == wanted else image.convert(wanted))
 
 
 def _area_sums(plane: NDArray[np.unsignedinteger], k: int) -> NDArray[np.uint32]:
@@ -199,26 +233,20 @@ def _area_sums(plane: NDArray[np.unsignedinteger], k: int) -> NDArray[np.uint32]
     return total
 
 
-def _divide(total: NDArray[np.uint32], by: NDArray[np.uint32] | np.uint32) -> UInt8:
+def _divide(total: NDArray[np.uint32], by: np.uint32) -> UInt8:
     """total / by rounded half up."""
     return ((total + by // np.uint32(2)) // by).astype(np.uint8)
 
 
 def area_average(image: UInt8, k: int) -> UInt8:
-    """The image (h, w, 3 or 4) at 1/k of its size, (h // k, w // k, 3 or 4): colour averaged with its alpha as the weight."""
+    """The image (h, w, 3 or 4) at 1/k of its size, (h // k, w // k, 3 or 4): colour averaged with its alpha as the weight,
+    black where that is 0 as it is rounded."""
     if k == 1:
         return image
-    out = np.empty((image.shape[0] // k, image.shape[1] // k, image.shape[2]), dtype=np.uint8)
-    block = np.uint32(k * k)
+    out = reduce(image, k, (image.shape[0] // k, image.shape[1] // k))
     if image.shape[2] == 3:
-        for c in range(3):
-            out[..., c] = _divide(_area_sums(image[..., c], k), block)
-        return out
-    alpha = image[..., 3].astype(np.uint16)
-    weight = _area_sums(alpha, k)
-    out[..., 3] = _divide(weight, block)
-    for c in range(3):
-        out[..., c] = _divide(_area_sums(image[..., c] * alpha, k), np.maximum(weight, 1))
+        return np.ascontiguousarray(out[..., :3])
+    out[..., :3] *= out[..., 3:] > 0
     return out
 
 

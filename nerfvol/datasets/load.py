@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,8 +31,10 @@ from nerfvol.datasets.images import (
     map_threads,
     masked_average,
     read_image,
+    read_pixels,
     read_small,
     turned,
+    writeable,
 )
 from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
 from nerfvol.datasets.listing import Frame, Listing, listed_names, named
@@ -157,13 +160,21 @@ def _scene_of(
     return bounds, decision, said
 
 
+@functools.lru_cache(maxsize=MOST_JUDGED)
+def _small(path: Path, changed: int, size: int) -> UInt8:
+    """A picture to look at. Every split of a scene is judged by the same ones: they are decoded once while their files stay
+    as they are."""
+    return read_small(path, JUDGED_SIZE)
+
+
 def _sample(views: Sequence[View], threads: int | None) -> list[tuple[View, UInt8]]:
     """A few training views with their pictures, small: what the kind of scene is judged by."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, MOST_JUDGED).round().astype(int))]
 
     def small(view: View) -> UInt8 | InputError:
         try:
-            return turned(read_small(view.path, JUDGED_SIZE), view.orientation)
+            state = view.path.stat()
+            return turned(_small(view.path, state.st_mtime_ns, state.st_size), view.orientation)
         except InputError as error:
             return error
 
@@ -187,7 +198,7 @@ def _seen_small(view: View, picture: UInt8) -> NDArray[np.bool_] | None:
 
 def _decoded(view: View, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
     """A view's image and mask at its final size."""
-    image, mask = read_image(view.path, view.orientation), view.seen()
+    image, mask = read_pixels(view.path, view.orientation), view.seen()
     lens = view.camera.intrinsics
     if image.shape[:2] != (lens.height, lens.width):
         raise InputError(f"{view.path}: the image is not of the size its header declares")
@@ -198,8 +209,9 @@ def _decoded(view: View, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | 
             mask = kept if mask is None else np.minimum(mask, kept)
         image = np.ascontiguousarray(image[..., :3]) if not unseen.all() else image
     if mask is None:
-        return area_average(image, downscale), None
-    return masked_average(image, mask, downscale)
+        return writeable(area_average(image, downscale)), None
+    image, mask = masked_average(image, mask, downscale)
+    return writeable(image), mask
 
 
 def _on_masks(views: Sequence[View], masks: Sequence[UInt8 | None], images: Sequence[UInt8]) -> list[str]:

@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from nerfvol import __version__
 from nerfvol.config.training import FINEST_LEVEL, Config
+from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
@@ -42,7 +43,7 @@ from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
-from nerfvol.training.session import Clock, Run, Say, Watch, read_saved
+from nerfvol.training.session import RESERVE_SHARE, Clock, Run, Say, Watch, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
@@ -53,6 +54,7 @@ WHY = {
 }
 MakeBar = Callable[[str, float], Any]
 """A phase's name and what is done of it, 0 to 1 -> a bar with tqdm's ``update`` and ``set_postfix_str``."""
+FEWEST_SCORED = 2
 LOG_EVERY = 50
 """Steps between two lines of the log."""
 
@@ -261,7 +263,7 @@ def finish(run: Run, trained: list[Model]) -> Results:
     return_free_memory()
     model = load_model(path)
     frame = run.data.frame
-    scores = evaluate(model, frame.dataset_back(run.data.held_out), run.background)
+    scores = evaluate(model, affordable_views(run, model, frame.dataset_back(run.data.held_out)), run.background)
     counts = _counts(model)
     row = {"seconds": seconds, "steps": run.steps[model.kind], "MB": written / 1e6, **counts}
     if run.results:
@@ -283,6 +285,23 @@ def finish(run: Run, trained: list[Model]) -> Results:
     few = run.data.compared.cameras[-1].intrinsics
     size = ", ".join(f"{count:,} {name}" for name, count in counts.items())
     return Results(run.folder, path, metrics, size, f"middle {few.width}x{few.height} of {len(run.data.compared)}")
+
+
+def affordable_views(run: Run, model: Model, held_out: Dataset) -> Dataset:
+    """The held-out views that can be scored in what a time budget leaves, or in the share of it that is kept for that; all
+    where there is no budget. Slow are the octrees of photographs that had seconds only: they are fog."""
+    budget = run.config.time_budget
+    if budget is None:
+        return held_out
+    started = time.perf_counter()
+    model.render(held_out.cameras[0], run.background)
+    each, left = time.perf_counter() - started, max(budget - run.clock.elapsed(), RESERVE_SHARE * budget)
+    n = max(FEWEST_SCORED, int(left / each))
+    if n >= len(held_out):
+        return held_out
+    run.say(f"a view takes {each:.1f} s to draw: {n} of the {len(held_out)} held-out views are scored, evenly chosen, to keep "
+            "near the time budget; nerfvol eval scores all")  # fmt: skip
+    return held_out.evenly(n)
 
 
 # ------------------------------------------------------------------ small things

@@ -17,6 +17,7 @@ from nerfvol.training import field_trainer, octree_trainer, prepare, session
 from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory import OctreePlan, gib, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
+from nerfvol.training.train import affordable_views
 from tests.fixtures.runs import Pretended, log_of, run_of, settings, start
 
 
@@ -160,3 +161,17 @@ def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
     drawn = octree.tiles[-1] * octree.foreground_share
     assert most_steps(1e4) == pytest.approx(1e4 * plan.foreground_tiles / drawn)
     assert most_steps(1.0) == most_steps(0.5) > 0  # however few the tiles
+
+
+@pytest.mark.parametrize("seconds, scored", [(0.05, 2), (0.0, None)])
+def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, seconds, scored):
+    """A tenth of a second for the end, less than two views of 50 ms take: two are scored all the same, evenly chosen."""
+    said = []
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=0.5 if scored else 1e6))
+    run.say = said.append
+    held_out = run.data.training
+    model = SimpleNamespace(render=lambda camera, background: time.sleep(seconds))
+    views = affordable_views(run, model, held_out)
+    assert len(views) == (scored or len(held_out)) and len(held_out) > 2
+    assert views.names[0] == held_out.names[0] and views.names[-1] == held_out.names[-1]
+    assert bool(scored) == any(f"2 of the {len(held_out)} held-out views are scored" in line for line in said)

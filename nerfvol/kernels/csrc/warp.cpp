@@ -167,7 +167,7 @@ void mean_of_block(const Bytes& s, int64_t top, int64_t left, int64_t factor, ui
     out[3] = uint8_t((weight + full / 2) / full);
 }
 
-// The blocks of one row that are whole and of full weight, from the sums of their columns; the others one by one.
+// The blocks of one row that are whole and of full or no weight, from the sums of their columns; the others one by one.
 void reduce_row(const Bytes& s, int64_t factor, int64_t y, int64_t blocks, std::vector<uint32_t>& columns, uint8_t* out) {
     const int64_t top = y * factor, n = s.width * s.channels;
     const bool whole = top + factor <= s.height;
@@ -179,17 +179,18 @@ void reduce_row(const Bytes& s, int64_t factor, int64_t y, int64_t blocks, std::
     const uint32_t full = uint32_t(factor * factor);
     for (int64_t x = 0; x < blocks; ++x, out += 4) {
         const int64_t left = x * factor;
+        const bool inside = whole && left + factor <= s.width;
         uint32_t sums[4] = {0, 0, 0, 0};
-        if (whole && left + factor <= s.width)
+        if (inside)
             for (int64_t k = left; k < left + factor; ++k)
                 for (int c = 0; c < s.channels; ++c) sums[c] += columns[size_t(k * s.channels + c)];
-        if (s.channels == 3) sums[3] = whole && left + factor <= s.width ? 255 * full : 0;
-        if (sums[3] != 255 * full) {
+        if (s.channels == 3) sums[3] = 255 * full;
+        if (!inside || (sums[3] != 255 * full && sums[3] != 0)) {
             mean_of_block(s, top, left, factor, out);
             continue;
         }
         for (int c = 0; c < 3; ++c) out[c] = uint8_t((sums[c] + full / 2) / full);
-        out[3] = 255;
+        out[3] = sums[3] ? 255 : 0;
     }
 }
 
