@@ -35,14 +35,9 @@ _MODELS: dict[str, tuple[int, type[Lens], str]] = {
     "FISHEYE": (15, Fisheye, "fx fy cx cy"),
 }
 _NAMES = {number: name for name, (number, *_) in _MODELS.items()}
-_UNSUPPORTED = {
-    7: "FOV",
-    11: "RAD_TAN_THIN_PRISM_FISHEYE",
-    12: "SIMPLE_DIVISION",
-    13: "DIVISION",
-    16: "EUCM",
-    17: "EQUIRECTANGULAR",
-}
+_UNREAD = {7: "FOV", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 16: "EUCM",
+           17: "EQUIRECTANGULAR"}  # fmt: skip
+"""COLMAP's others, by name for the sentence that refuses them."""
 
 
 class ImageRecord(NamedTuple):
@@ -157,10 +152,8 @@ def _cameras_binary(path: Path) -> dict[int, Calibration]:
     for _ in range(cursor.take("Q")[0]):
         camera, number, width, height = cursor.take("iiQQ")
         if number not in _NAMES:
-            known = ", ".join(_MODELS)
-            raise InputError(
-                f"{path}, camera {camera}: lens model {_UNSUPPORTED.get(number, number)} is not supported; known models: {known}"
-            )
+            known, model = ", ".join(_MODELS), _UNREAD.get(number, number)
+            raise InputError(f"{path}, camera {camera}: lens model {model} is not supported; known models: {known}")
         model = _NAMES[number]
         found[camera] = _checked(path, camera, model, width, height, cursor.take(f"{len(_MODELS[model][2].split())}d"))
     return found

@@ -93,8 +93,9 @@ def _looks_like(path: Path) -> str:
         return "HEIC or a video, as phones write them: convert it to JPEG"
     if not start:
         return "nothing, it is empty"
-    names = {b"%!PS": "PostScript", b"\xc5\xd0\xd3\xc6": "PostScript", b"DDS ": "DDS", b"GIF8": "GIF", b"%PDF": "PDF", b"\x76\x2f\x31\x01": "OpenEXR", b"\x00\x00\x00\x0cjP": "JPEG 2000",
-             b"8BPS": "a Photoshop document", b"\x00\x05\x16\x07": "what macOS leaves next to a file on foreign disks",
+    names = {b"%!PS": "PostScript", b"\xc5\xd0\xd3\xc6": "PostScript", b"DDS ": "DDS", b"GIF8": "GIF", b"%PDF": "PDF",
+             b"\x76\x2f\x31\x01": "OpenEXR", b"\x00\x00\x00\x0cjP": "JPEG 2000", b"8BPS": "a Photoshop document",
+             b"\x00\x05\x16\x07": "what macOS leaves next to a file on foreign disks",
              b"vers": "a Git LFS pointer: fetch the file itself"}  # fmt: skip
     return next((name for magic, name in names.items() if start.startswith(magic)), "none of them")
 
