@@ -9,7 +9,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 demo: $(BIN)/python
-	$(BIN)/pip install -q -c constraints.txt .
+	$(BIN)/pip install -q -c constraints.txt '.[mlp]'
 	$(BIN)/python train.py
 
 test: $(BIN)/python
