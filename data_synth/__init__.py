@@ -4,33 +4,39 @@
 >>> scene = ds.scenes.cloud(resolution=64)
 >>> picture = ds.render(scene, scene.viewpoints.camera(30, 20, 64, 64), integrator=ds.Path(spp=4))
 
-docs/data_synth.md has a snippet for each of the names below.
+docs/data_synth.md has a snippet for each of the names below. They are loaded when they are asked for: whoever only writes the file
+of a volume does not need what compiles scenes (numba, the extra ``nerfvol[synth]``).
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-from data_synth import (
-    clouds,
-    lights,
-    materials,
-    media,
-    phase,
-    scenes,
-    sggx,
-    spongecake,
-    surfaces,
-    volumes,
-)  # fmt: skip
-from data_synth.cameras import Camera, Viewpoints, look_at
-from data_synth.dataset import Options, render_view, write_dataset
-from data_synth.errors import InputError, RenderWarning
-from data_synth.image import Picture, read_exr, write_exr, write_png
-from data_synth.integrators import DeepShadow, Emission, March, Path, Preview
-from data_synth.scene import Scene
-from data_synth.scene_file import load as load_scene
-from data_synth.transmittance import sample_flights, sample_transmittance
-
-render = render_view
+if TYPE_CHECKING:
+    from data_synth import (
+        clouds,
+        lights,
+        materials,
+        media,
+        phase,
+        scenes,
+        sggx,
+        spongecake,
+        surfaces,
+        volumes,
+    )  # fmt: skip
+    from data_synth.cameras import Camera, Viewpoints, look_at
+    from data_synth.dataset import Options, render_view, write_dataset
+    from data_synth.dataset import render_view as render
+    from data_synth.errors import InputError, RenderWarning
+    from data_synth.image import Picture, read_exr, write_exr, write_png
+    from data_synth.integrators import DeepShadow, Emission, March, Path, Preview
+    from data_synth.scene import Scene
+    from data_synth.scene_file import load as load_scene
+    from data_synth.transmittance import sample_flights, sample_transmittance
 
 __all__ = [
     "Camera", "DeepShadow", "Emission", "InputError", "March", "Options", "Path", "Picture", "Preview", "RenderWarning",
@@ -38,3 +44,25 @@ __all__ = [
     "render_view", "sample_flights", "sample_transmittance", "scenes", "sggx", "spongecake", "surfaces",
     "volumes", "write_dataset", "write_exr", "write_png",
 ]  # fmt: skip
+
+_HOMES = {
+    "Camera": "cameras", "Viewpoints": "cameras", "look_at": "cameras", "Options": "dataset", "render_view": "dataset",
+    "render": "dataset:render_view", "write_dataset": "dataset", "InputError": "errors", "RenderWarning": "errors",
+    "Picture": "image", "read_exr": "image", "write_exr": "image", "write_png": "image", "DeepShadow": "integrators",
+    "Emission": "integrators", "March": "integrators", "Path": "integrators", "Preview": "integrators", "Scene": "scene",
+    "load_scene": "scene_file:load", "sample_flights": "transmittance", "sample_transmittance": "transmittance",
+}  # fmt: skip
+"""The module of each name, and its name there where that differs; the rest of ``__all__`` are modules."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, own = _HOMES.get(name, name).partition(":")
+    loaded = importlib.import_module(f"{__name__}.{module}")
+    value = globals()[name] = getattr(loaded, own or name) if name in _HOMES else loaded
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

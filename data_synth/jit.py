@@ -21,8 +21,13 @@ from functools import cache
 from pathlib import Path
 from typing import TextIO
 
-import numba
-from numba.core import event
+from data_synth.errors import InputError
+
+try:
+    import numba
+    from numba.core import event
+except ImportError as error:
+    raise InputError(f"simulated scenes are compiled by numba ({error}): pip install 'nerfvol[synth]'") from error
 
 # error_model="numpy": x/0 is inf as in IEEE 754, no exception branch behind every division.
 # _nrt=False: no array is ever made inside compiled code, so none needs its references counted. Counting them, with

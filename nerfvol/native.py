@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from nerfvol.errors import InputError
+
 CACHE_LINE = 64
 """Bytes; also the width of the widest vector."""
 
@@ -33,13 +35,25 @@ def native() -> ModuleType | None:
         import _nerfvol_kernels  # pyright: ignore[reportMissingImports]  # the extension, where it was built
     except ImportError as e:
         warnings.warn(
-            f"nerfvol's compiled kernels are not available ({e}): running on the torch reference, which is far slower; "
-            "reinstall with a C++17 compiler at hand to get them",
+            f"nerfvol's compiled kernels are not available ({e}): running on the torch reference, which is far slower "
+            "and needs nerfvol[mlp]; reinstall with a C++17 compiler at hand to get them",
             ReferencePathWarning,
             stacklevel=2,
         )
         return None
     return _nerfvol_kernels
+
+
+def need_torch(what: str) -> None:
+    """Everything that imports torch asks here first: the package runs without it where the kernels are compiled.
+
+    Raises:
+        InputError: torch is not installed; ``what`` is what needs it, the beginning of the sentence.
+    """
+    try:
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"{what} needs torch ({error}): pip install 'nerfvol[mlp]'") from error
 
 
 def aligned_empty(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -5,12 +5,20 @@ PlenOctrees, Plenoxels and 3D Gaussian splatting files: Y_00 = 0.282..., Y_1 = 0
 orthonormal over the sphere: the integral of Y_j * Y_k is 1 if j = k and else 0.
 """
 
-import math
+from __future__ import annotations
 
-import torch
-from torch import Tensor
+import math
+import sys
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MAX_DEGREE = 4
+Values = TypeVar("Values", "np.ndarray", "Tensor")
+"""numpy arrays or torch tensors: what comes out is of the kind that went in."""
 
 
 def _norm(numerator: float, denominator: float) -> float:
@@ -31,7 +39,7 @@ def basis_dim(degree: int) -> int:
     return (degree + 1) ** 2
 
 
-def eval_basis(degree: int, dirs: Tensor) -> Tensor:
+def eval_basis(degree: int, dirs: Values) -> Values:
     """Values of the basis functions.
 
     Args:
@@ -39,21 +47,24 @@ def eval_basis(degree: int, dirs: Tensor) -> Tensor:
         dirs: unit directions, (..., 3), any floating type.
 
     Returns:
-        (..., (degree + 1)**2) in the type of ``dirs``. Differentiable. Directions are taken as they are: these are
+        (..., (degree + 1)**2) in the type of ``dirs``. Differentiable in torch. Directions are taken as they are: these are
         the harmonics only on the unit sphere.
 
     Raises:
         ValueError: another degree, or dirs that are not floating point of shape (..., 3).
     """
     basis_dim(degree)
-    if dirs.shape[-1:] != (3,) or not dirs.is_floating_point():
+    in_numpy = isinstance(dirs, np.ndarray)
+    is_floating = dirs.dtype.kind == "f" if in_numpy else dirs.is_floating_point()
+    if dirs.shape[-1:] != (3,) or not is_floating:
         raise ValueError(f"dirs must be floating point of shape (..., 3), got {dirs.dtype} {tuple(dirs.shape)}")
-    x, y, z = dirs.unbind(-1)
-    values = [torch.full_like(x, Y00)]
+    library = np if in_numpy else sys.modules["torch"]  # whoever has a tensor has loaded it
+    x, y, z = dirs[..., 0], dirs[..., 1], dirs[..., 2]
+    values = [library.full_like(x, Y00)]
     if degree >= 1:
         values += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree < 2:
-        return torch.stack(values, dim=-1)
+        return library.stack(values, -1)
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     values += [_C2[0] * xy, -_C2[0] * yz, _C2[1] * (2 * zz - xx - yy), -_C2[0] * xz, _C2[2] * (xx - yy)]
     if degree >= 3:
@@ -78,10 +89,10 @@ def eval_basis(degree: int, dirs: Tensor) -> Tensor:
             -_C4[1] * xz * (xx - 3 * yy),
             _C4[6] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
-    return torch.stack(values, dim=-1)
+    return library.stack(values, -1)
 
 
-def eval_colour(sh: Tensor, dirs: Tensor) -> Tensor:
+def eval_colour(sh: Values, dirs: Values) -> Values:
     """Colour 1/2 + sum_k sh_k Y_k(d), without a clamp.
 
     Args:
@@ -95,6 +106,6 @@ def eval_colour(sh: Tensor, dirs: Tensor) -> Tensor:
         ValueError: sh of another shape, a degree above 4, or dirs as in :func:`eval_basis`.
     """
     degree = math.isqrt(sh.shape[-1]) - 1
-    if sh.dim() < 2 or sh.shape[-2] != 3 or (degree + 1) ** 2 != sh.shape[-1]:
+    if sh.ndim < 2 or sh.shape[-2] != 3 or (degree + 1) ** 2 != sh.shape[-1]:
         raise ValueError(f"sh must have shape (..., 3, (degree + 1)**2), got {tuple(sh.shape)}")
-    return 0.5 + (sh * eval_basis(degree, dirs).unsqueeze(-2)).sum(-1)
+    return 0.5 + (sh * eval_basis(degree, dirs)[..., None, :]).sum(-1)

@@ -48,6 +48,12 @@ class Calibration:
         fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)  # square pixels where only one is given
         if fx is None or fy is None:
             raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
+        if isinstance(self.lens, BrownConrady) and max(width / fx, height / fy) > _WIDEST and min(fx, fy) > 0:
+            degrees = math.degrees(2 * math.atan(0.5 * max(width / fx, height / fy)))
+            raise InputError(
+                f"a focal length of {min(fx, fy):g} pixels in a picture of {width}x{height} is a field of view of "
+                f"{degrees:.1f} degrees: is it in millimetres, or a share of the picture's width? State it in pixels"
+            )
         cx = 0.5 * width if self.cx is None else self.cx * sx
         cy = 0.5 * height if self.cy is None else self.cy * sy
         return Intrinsics(width, height, fx, fy, cx, cy, self.lens)
@@ -96,6 +102,8 @@ class Calibration:
         raise InputError(f"expected an image of {expected}, got {width}x{height}")
 
 
+_WIDEST = 2 * math.tan(math.radians(80))
+"""A picture's width in focal lengths: a lens without a fisheye's model sees less than 160 degrees."""
 _DELIBERATE = 1.3
 """Pictures of another size than is stated are taken for resized ones by at least this factor; by less it is a mistake."""
 _ALIKE = 0.03
@@ -127,7 +135,12 @@ CAMERA_MODELS: dict[str, type[Lens]] = {
     "SIMPLE_RADIAL": BrownConrady,
     "RADIAL": BrownConrady,
     "PERSPECTIVE": BrownConrady,
+    "FULL_OPENCV": BrownConrady,
     "OPENCV_FISHEYE": Fisheye,
+    "SIMPLE_RADIAL_FISHEYE": Fisheye,
+    "RADIAL_FISHEYE": Fisheye,
+    "SIMPLE_FISHEYE": Fisheye,
+    "FISHEYE": Fisheye,
 }
 """The lens that a JSON file's ``camera_model`` names; of several names a lens is written with its first."""
 _DEFAULT_MODEL = "OPENCV"
@@ -178,6 +191,8 @@ def read_calibration(data: Mapping[str, Any]) -> Calibration:
     if unsupported:
         raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
     lens = Fisheye if data.get("is_fisheye") is True else CAMERA_MODELS[model]
+    if model == "FULL_OPENCV" and any(finite_number(data, key) for key in ("k4", "k5", "k6")):
+        raise InputError("the rational terms k4, k5, k6 of FULL_OPENCV are not supported; export undistorted images")
     # What other lenses have is not read: exporters write zeros or leftovers of p1, p2 next to a fisheye lens.
     coefficients = {name: finite_number(data, name) or 0.0 for name in lens.names()}
     degrees = {key: finite_number(data, key) for key in ("x_fov", "y_fov")}

@@ -67,6 +67,15 @@ def assemble(
     return settings
 
 
+def _packaged(path: str | os.PathLike[str]) -> str | os.PathLike[str]:
+    """``path``; where there is no such file, one of that name that comes with the package (``configs/smoke.yaml``)."""
+    if os.path.exists(path) or Path(path).parent.name not in ("", "configs"):
+        return path
+    package = Path(__file__).resolve().parents[1]
+    places = (package / "configs" / Path(path).name, package.parent / "configs" / Path(path).name)
+    return next((place for place in places if place.is_file()), path)
+
+
 def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The mapping in a YAML file, read with the loader that builds plain values only; empty where the file is.
 
@@ -74,7 +83,7 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
         InputError: the file cannot be read, is no YAML, or holds something else than keys and values.
     """
     try:
-        document = yaml.load(read_text(path), Loader=_Loader)
+        document = yaml.load(read_text(_packaged(path)), Loader=_Loader)
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not a config file: it is not UTF-8 text") from error
     except yaml.YAMLError as error:

@@ -7,6 +7,7 @@ the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -93,7 +94,7 @@ def read(folder: Path, split: str) -> Listing:
     source, calibrations = images_file(model), read_cameras(model)
     if source.suffix == ".bin" and (model / "images.txt").is_file():
         messages.append(f"{model.relative_to(folder)} holds a model as text too, which is not read")
-    photographs = image_folder(folder)
+    photographs = _photographs(folder, source)
     finder, masks, poses = ImageFinder(photographs), MaskFinder(folder, photographs), Poses(source)
     frames, numbers = [], []
     for number, name, quaternion, translation, camera in read_images(model):
@@ -108,6 +109,11 @@ def read(folder: Path, split: str) -> Listing:
             frames.append(Frame(name, path, c2w, calibrations[camera], masks.of(name, path)))
             numbers.append(number)
     messages += poses.messages()
+    listed = Counter(frame.listed for frame in frames)
+    if twice := [name for name, count in listed.items() if count > 1]:
+        messages.append(
+            f"{len(twice)} images are in the model more than once, each with a pose of its own: {named(twice)}"
+        )
     if not frames:
         raise InputError(f"{source}: the model holds no images")
     present = [frame for frame in frames if frame.path is not None]
@@ -122,6 +128,14 @@ def read(folder: Path, split: str) -> Listing:
         listing.messages += _doubt(path, dict(zip(numbers, frames, strict=True)))
         listing.read_points = lambda: model_points(path)
     return listing
+
+
+def _photographs(folder: Path, source: Path) -> Path:
+    """Where the photographs of the model of ``source`` lie: in ``folder`` or, where that is the model's own, above it."""
+    name = next((record.name for record in read_images(source.parent)), "")
+    homes = (folder, folder.parent, folder.parent.parent) if source.parent == folder else (folder,)
+    found = (image_folder(home) for home in homes)
+    return next((place for place in found if ImageFinder(place).find(name) is not None), image_folder(folder))
 
 
 def _in_no_model(photographs: Path, frames: Sequence[Frame]) -> list[str]:

@@ -19,7 +19,7 @@ from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_bytes, read_text
 
 # COLMAP's model ids, the lens they are, their parameters in its order; f stands for both focal lengths. What the lens has no
-# coefficient for must be zero.
+# coefficient for has a star and must be zero.
 _MODELS: dict[str, tuple[int, type[Lens], str]] = {
     "SIMPLE_PINHOLE": (0, BrownConrady, "f cx cy"),
     "PINHOLE": (1, BrownConrady, "fx fy cx cy"),
@@ -27,11 +27,17 @@ _MODELS: dict[str, tuple[int, type[Lens], str]] = {
     "RADIAL": (3, BrownConrady, "f cx cy k1 k2"),
     "OPENCV": (4, BrownConrady, "fx fy cx cy k1 k2 p1 p2"),
     "OPENCV_FISHEYE": (5, Fisheye, "fx fy cx cy k1 k2 k3 k4"),
-    "FULL_OPENCV": (6, BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 rational4 rational5 rational6"),
+    "FULL_OPENCV": (6, BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 k4* k5* k6*"),
     "SIMPLE_RADIAL_FISHEYE": (8, Fisheye, "f cx cy k1"),
     "RADIAL_FISHEYE": (9, Fisheye, "f cx cy k1 k2"),
+    "THIN_PRISM_FISHEYE": (10, Fisheye, "fx fy cx cy k1 k2 p1* p2* k3 k4 sx1* sy1*"),
+    "SIMPLE_FISHEYE": (14, Fisheye, "f cx cy"),
+    "FISHEYE": (15, Fisheye, "fx fy cx cy"),
 }
 _NAMES = {number: name for name, (number, *_) in _MODELS.items()}
+_UNREAD = {7: "FOV", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 16: "EUCM",
+           17: "EQUIRECTANGULAR"}  # fmt: skip
+"""COLMAP's others, by name for the sentence that refuses them."""
 
 
 class ImageRecord(NamedTuple):
@@ -92,9 +98,11 @@ def read_points(path: Path) -> Iterator[PointRecord]:
 def _calibration(model: str, width: int, height: int, parameters: tuple[float, ...]) -> Calibration:
     _, lens, names = _MODELS[model]
     values = dict(zip(names.split(), parameters, strict=True))
-    rational = [name for name in ("rational4", "rational5", "rational6") if values.get(name)]
-    if rational:
-        raise InputError("the rational terms k4, k5, k6 of FULL_OPENCV are not supported; export undistorted images")
+    if beyond := [name for name, value in values.items() if name.endswith("*") and value]:
+        raise InputError(
+            f"the term {beyond[0][:-1]} of {model} is not supported unless it is zero; export undistorted images "
+            "(colmap image_undistorter)"
+        )
     if not all(np.isfinite(parameters)) or min(width, height) < 1:
         raise InputError(f"a camera must have a size and finite parameters, got {width}x{height} and {parameters}")
     focal = values.get("f")
@@ -144,8 +152,8 @@ def _cameras_binary(path: Path) -> dict[int, Calibration]:
     for _ in range(cursor.take("Q")[0]):
         camera, number, width, height = cursor.take("iiQQ")
         if number not in _NAMES:
-            known = ", ".join(_MODELS)
-            raise InputError(f"{path}, camera {camera}: lens model {number} is not supported; known models: {known}")
+            known, model = ", ".join(_MODELS), _UNREAD.get(number, number)
+            raise InputError(f"{path}, camera {camera}: lens model {model} is not supported; known models: {known}")
         model = _NAMES[number]
         found[camera] = _checked(path, camera, model, width, height, cursor.take(f"{len(_MODELS[model][2].split())}d"))
     return found

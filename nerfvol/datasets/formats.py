@@ -67,4 +67,41 @@ def find_format(path: Path) -> Format:
         if row.reader.recognises(path):
             return row
     *others, last = (f"no {row.looks_for}" for row in FORMATS)
-    raise InputError(f"{path}: expected posed images, but found {', '.join(others)} and {last}")
+    raise InputError(f"{path}: expected posed images, but found {', '.join(others)} and {last}{_what_there_is(path)}")
+
+
+_OTHER_PROGRAMS = {
+    "keyframes": "Polycam's raw data, which `ns-process-data polycam` converts",
+    "rgbd": "Record3D's, which `ns-process-data record3d` converts",
+    "cameras_sphere.npz": "IDR's and NeuS' (DTU), which is not read",
+    "opensfm": "OpenDroneMap's, which `ns-process-data odm` converts",
+    "reconstruction.json": "OpenSfM's, which `opensfm export_colmap` converts",
+    "cameras.xml": "Metashape's, which `ns-process-data metashape` converts",
+    "cameras.sfm": "Meshroom's, which is not read",
+    "bundle.out": "Bundler's, which is not read",
+    "groundtruth.txt": "TUM's tracks, which are not read",
+    "pose": "ScanNet's, 7-Scenes' or NSVF's without intrinsics.txt, which is not read",
+}
+"""By what a folder of other programs is known, whose it is, and what makes of it something that is read."""
+
+
+def _what_there_is(path: Path) -> str:
+    """The end of a sentence on what no format recognises: where one lies near it, or whose it looks like."""
+    if path.is_file():
+        return "; poses of a video or of photographs are found by `nerfvol capture`"
+    try:
+        below = [entry for entry in path.iterdir() if entry.is_dir() and entry.name != "__MACOSX"]
+        below += [entry for folder in below for entry in folder.iterdir() if entry.is_dir()]
+    except OSError:
+        return ""
+    if near := [
+        place for place in (path.parent, *sorted(below)) if any(row.reader.recognises(place) for row in FORMATS)
+    ]:
+        return f"; {' and '.join(map(str, near[:3]))} {'is one' if len(near) == 1 else 'are such'}"
+    for name, whose in _OTHER_PROGRAMS.items():
+        if (path / name).exists():
+            return f"; {name} is {whose}"
+    suffixes = (".jpg", ".jpeg", ".png", ".heic")
+    if any(entry.suffix.lower() in suffixes for folder in (path, path / "images") for entry in folder.glob("*")):
+        return "; of photographs without poses, `nerfvol capture` or --poses auto finds them"
+    return ""

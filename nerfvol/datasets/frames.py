@@ -219,6 +219,15 @@ def _astray(training: Sequence[View], views: Sequence[View]) -> set[int]:
     return found
 
 
+def _may_lie(view: View, header: ImageHeader) -> bool:
+    """Whether nothing tells which way up the poses mean a picture that its EXIF orientation would turn."""
+    if view.orientation != 1 or header.orientation == 1:
+        return False
+    calibration, (width, height) = view.frame.calibration, header.size
+    stated = calibration.width is not None and calibration.height is not None
+    return header.orientation <= 4 or width == height or not (stated or calibration.cx is not None)
+
+
 def _tell(
     frames: Sequence[Frame], headers: dict[int, ImageHeader], made: dict[int, View], wrong: dict[int, InputError],
     astray: set[int], messages: list[str],
@@ -238,6 +247,12 @@ def _tell(
         messages.append(
             f"{len(turned)} of {len(views)} photographs lie on their side in their files and are turned as their EXIF "
             "orientation says, since the calibration is for upright ones"
+        )
+    as_stored = [view.frame.listed for view in views if _may_lie(view, headers[id(view.frame)])]
+    if as_stored:
+        messages.append(
+            f"{len(as_stored)} of {len(views)} photographs have an EXIF orientation, and their calibration fits them as stored "
+            f"and turned alike: they are taken as stored ({named(as_stored)})"
         )
     scaled: Counter[tuple[tuple[int, int], tuple[int, int], bool]] = Counter()
     off = []

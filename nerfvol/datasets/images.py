@@ -90,12 +90,17 @@ def _looks_like(path: Path) -> str:
             start = file.read(16)
     except OSError:
         return "none"
+    if start[4:12] == b"ftypavif":
+        return "AVIF: convert it to JPEG"
     if start[4:8] == b"ftyp":
         return "HEIC or a video, as phones write them: convert it to JPEG"
+    if not start:
+        return "nothing, it is empty"
     names = {b"%!PS": "PostScript", b"\xc5\xd0\xd3\xc6": "PostScript", b"DDS ": "DDS", b"GIF8": "GIF", b"%PDF": "PDF",
-             b"8BPS": "a Photoshop document", b"\x00\x05\x16\x07": "what macOS leaves next to a file on foreign disks",
+             b"\x76\x2f\x31\x01": "OpenEXR", b"\x00\x00\x00\x0cjP": "JPEG 2000", b"8BPS": "a Photoshop document",
+             b"\x00\x05\x16\x07": "what macOS leaves next to a file on foreign disks",
              b"vers": "a Git LFS pointer: fetch the file itself"}  # fmt: skip
-    return next((name for magic, name in names.items() if start.startswith(magic)), "none")
+    return next((name for magic, name in names.items() if start.startswith(magic)), "none of them")
 
 
 @dataclass(frozen=True)
@@ -211,7 +216,7 @@ def read_mask(path: Path, size: tuple[int, int], orientation: int = 1) -> UInt8:
 
 
 def _pixels(image: Image.Image, path: Path) -> UInt8:
-    if image.mode.startswith("I;16"):
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):  # as older Pillows call it
         grey = (np.asarray(image).astype(np.uint32) + 128) // 257
         return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
     if image.mode in ("I", "F"):

@@ -138,6 +138,12 @@ def _doubts(cameras: Sequence[Camera], focus: Focus) -> list[str]:
     """Sentences on the two commonest mistakes of those who write poses themselves."""
     if len(cameras) < 4:
         return []
+    poses = np.stack([camera.c2w for camera in cameras])
+    apart = np.abs(poses - poses[0]).max(axis=0)
+    if (apart[:3, 3] <= 1e-9 * np.abs(poses[0, :3, 3])).all():
+        if (apart <= 1e-9).all():
+            return [f"all {len(cameras)} poses are the same: were the cameras found at all?"]
+        return ["all cameras stand at one point, as in a panorama: nothing tells how far away things are"]
     inverse = focus_point([_inverted(camera) for camera in cameras])
     meets = focus.certainty >= WELL_FIXED and focus.spread < 0.2
     if not (meets and focus.ahead >= LOOKS_IN) and (

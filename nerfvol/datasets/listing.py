@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,8 +150,9 @@ class MaskFinder:
         self._finder = ImageFinder(folder)
         self._beside: dict[Path, ImageFinder] = {}
         homes = [folder] if images is None or images == folder else [folder, images, images.parent]
-        self._folders = [place for place in dict.fromkeys(home / "masks" for home in homes) if place.is_dir()]
-        self.stated = 0
+        places = dict.fromkeys(home / name for home in homes for name in ("masks", "mask"))
+        self._folders = [place for place in places if place.is_dir()]
+        self._in_use: set[Path] = set()
         self.missing: list[str] = []
 
     def of(self, listed: str, path: Path | None, stated: str | None = None) -> tuple[MaskFile, ...]:
@@ -157,7 +161,6 @@ class MaskFinder:
             return ()
         found = []
         if stated is not None:
-            self.stated += 1
             mask = self._finder.find(stated)
             if mask is None:
                 self.missing.append(stated)
@@ -168,17 +171,21 @@ class MaskFinder:
             if (mask := beside.find(name)) is not None:
                 found.append(MaskFile(mask, black_is_out=False))
                 break
+        for name in _beside(path) if not found else ():
+            if (mask := beside.find(name)) is not None and mask != path:
+                return (MaskFile(mask),)
         if not found:
             found += self._in_folders(listed, path)
         return tuple(found)
 
     def _in_folders(self, listed: str, path: Path) -> list[MaskFile]:
-        """COLMAP's: the image's name and .png, below a folder of masks; or the image's stem."""
+        """COLMAP's: the image's name and .png, below a folder of masks; or the image's stem, alone or as Metashape ends it."""
         for folder in self._folders:
             finder = self._beside.setdefault(folder, ImageFinder(folder))
             inside = listed.replace("\\", "/")
-            for name in (f"{inside}.png", f"{path.name}.png", inside, path.stem):
+            for name in (f"{inside}.png", f"{path.name}.png", inside, path.stem, *_beside(path)):
                 if path.parent != folder and (mask := finder.find(name)) is not None and mask != path:
+                    self._in_use.add(folder)
                     return [MaskFile(mask)]
         return []
 
@@ -190,6 +197,10 @@ class MaskFinder:
             said.append(
                 f"{len(with_mask)} of {len(frames)} images have masks: what those leave out takes no part in training "
                 "and scores"
+            )
+        if idle := [folder for folder in self._folders if folder not in self._in_use and not with_mask and frames]:
+            said.append(
+                f"{idle[0]} is not used: none of its files is named like an image (NAME.png, NAME.jpg.png or NAME_mask.png)"
             )
         if self.missing:
             said.append(
@@ -209,9 +220,15 @@ def listed_names(frames: Sequence[Frame]) -> list[str]:
     return [f"{i:04d}_{name}" for i, name in enumerate(long)] if len(set(long)) < len(long) else long
 
 
+def _beside(path: Path) -> tuple[str, str, str]:
+    """What RealityCapture and Metashape call the mask of the image ``path``, without the suffix."""
+    return f"{path.name}.mask", f"{path.stem}.mask", f"{path.stem}_mask"
+
+
 def is_photograph(path: Path) -> bool:
-    """Whether a file's name is a photograph's: a known suffix, and no leftover of an operating system (``._a.jpg``)."""
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith((".", "dynamic_mask_"))
+    """Whether a file's name is a photograph's: a known suffix, no leftover of an operating system (``._a.jpg``), no mask."""
+    is_mask = path.name.startswith("dynamic_mask_") or path.stem.endswith((".mask", "_mask"))
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not is_mask
 
 
 class ImageFinder:
@@ -224,28 +241,29 @@ class ImageFinder:
     def find(self, listed: str) -> Path | None:
         """The file, or None if there is none.
 
-        A path that leads nowhere, absolute ones of another machine above all, is looked for by its last parts below the
-        folder.
+        A path that leads nowhere is looked for by its last parts below the folder where it is an absolute one of another
+        machine, else by its name in the folder itself; and as the address it may be (file:///a%20b).
         """
         try:
-            return self._find(self._folder / listed.replace("\\", "/")) or self._by_end(listed)
+            found = self._find(self._folder / listed.replace("\\", "/")) or self._by_end(listed)
+            address = unquote(re.sub("^file://", "", listed))
+            return found if found is not None or address == listed else self.find(address)
         except (OSError, ValueError):  # a name too long, half a character
             return None
 
     def _by_end(self, listed: str) -> Path | None:
         absolute = listed.startswith(("/", "\\")) or listed[1:3] in (":\\", ":/") or listed.startswith("..")
         parts = [part for part in listed.replace("\\", "/").split("/") if part not in ("", ".", "..")]
-        for first in range(len(parts)) if absolute else ():
+        for first in range(len(parts)) if absolute else range(len(parts) - 1, len(parts)):
             if (found := self._find(self._folder.joinpath(*parts[first:]))) is not None:
                 return found
         return None
 
     def _find(self, path: Path) -> Path | None:
-        names = self._names(path.parent)
-        if path.name in names or path.name.lower() in names:
-            found = path if path.is_file() else names[path.name.lower()]
+        names, stem = self._names(path.parent), _plain(path.name)
+        if stem in names:
+            found = path if path.is_file() else names[stem]
             return found if found.is_file() else None
-        stem = path.name.lower()
         for suffix in SUFFIXES:
             if stem + suffix in names:
                 return names[stem + suffix]
@@ -257,5 +275,10 @@ class ImageFinder:
                 entries = sorted(folder.iterdir())
             except OSError:  # a folder that is not there holds no images; the caller reports them as missing
                 entries = []
-            self._listings[folder] = {e.name.lower(): e for e in entries if not e.name.startswith(".")}
+            self._listings[folder] = {_plain(e.name): e for e in entries if not e.name.startswith(".")}
         return self._listings[folder]
+
+
+def _plain(name: str) -> str:
+    """A file's name in one spelling: macOS writes é as two characters."""
+    return unicodedata.normalize("NFC", name).lower()

@@ -7,6 +7,7 @@ original photographs. Source: docs/data.md.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -56,10 +57,14 @@ def read(folder: Path, split: str) -> Listing:
             raise InputError(f"{path}, image {name}: {error}") from None
     said += poses.messages() + masks.messages(frames)
     chosen, training, sentence = hold_out(frames, split)
-    depths = rows[np.isfinite(rows[:, 15:]).all(axis=1), 15:]
-    near, far = (float(depths[:, 0].min()), float(depths[:, 1].max())) if len(depths) else (np.nan, np.nan)
-    if not 0 < near < far < 1e15:
+    depths = rows[(rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & (rows[:, 16] < 1e15), 15:]
+    if not len(depths):
+        near, far = rows[0, 15:]
         raise InputError(f"{path}: expected finite depths with 0 < near < far, got {near:g} and {far:g}")
+    if len(depths) < len(rows):
+        said.append(f"{len(rows) - len(depths)} of {len(rows)} rows of {path.name} state no depths with 0 < near < far: the "
+                    "others' count")  # fmt: skip
+    near, far = float(depths[:, 0].min()), float(depths[:, 1].max())
     return Listing(chosen, training, path, BoundsHint(near_far=(near, far)), [*said, sentence])
 
 
@@ -87,11 +92,14 @@ def _registered(folder: Path, images: Path, names: list[str], count: int) -> tup
 
 
 def image_folder(folder: Path) -> Path:
-    """images, or the least reduced of images_2, images_4, ...; a folder without them holds the photographs itself."""
-    found = [entry for entry in folder.iterdir() if entry.is_dir() and entry.name.startswith("images")]
-    factors = {entry: entry.name.removeprefix("images").removeprefix("_") or "1" for entry in found}
-    usable = [entry for entry in found if factors[entry].isdigit()]
-    return min(usable, key=lambda entry: int(factors[entry])) if usable else folder
+    """images, or the least reduced of images_2, images_4, ..., in any case; else input, as Gaussian splatting's scripts call
+    it, image, rgb or color; a folder without them holds the photographs itself."""
+    factors = {}
+    for entry in sorted(folder.iterdir()):
+        factor = re.fullmatch(r"images_?(\d*)|(input|image|rgb|color)", entry.name.lower())
+        if factor is not None and entry.is_dir():
+            factors[entry] = np.inf if factor[2] else int(factor[1] or 1)
+    return min(factors, key=lambda entry: factors[entry]) if factors else folder
 
 
 def _load_rows(path: Path) -> NDArray[np.float64]:
@@ -100,6 +108,10 @@ def _load_rows(path: Path) -> NDArray[np.float64]:
         raise InputError(f"{path}: expected an array of shape (views, 17), got {rows.shape}")
     if not np.issubdtype(rows.dtype, np.floating):
         raise InputError(f"{path}: expected floating-point numbers, got {rows.dtype}")
+    rows, stated = rows.copy(), np.isfinite(rows[:, [4, 9, 14]]).all(axis=1)
+    lost = ~stated & ~np.isfinite(rows[:, :15]).any(axis=1)
+    if stated.any():  # a view without a pose is left out later, whatever its lens
+        rows[np.ix_(lost, [4, 9, 14])] = rows[stated.argmax(), [4, 9, 14]]
     if not np.isfinite(rows[:, [4, 9, 14]]).all():
         raise InputError(f"{path}: expected finite sizes and focal lengths, got NaN or infinity")
     return rows.astype(np.float64)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.datasets.bounds import BoundsHint
-from nerfvol.datasets.listing import Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
+from nerfvol.datasets.listing import MOST_LOST, Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_text
 from nerfvol.region import check_box
@@ -42,14 +42,21 @@ def read(folder: Path, split: str) -> Listing:
     frames: dict[str, list[Frame]] = {}
     everything = []
     poses, masks = Poses(folder / _POSES), MaskFinder(folder, folder / _IMAGES)
-    for image in sorted(p for p in (folder / _IMAGES).iterdir() if is_photograph(p)):
+    images = sorted(p for p in (folder / _IMAGES).iterdir() if is_photograph(p))
+    bare = [image.name for image in images if not (folder / _POSES / f"{image.stem}.txt").is_file()]
+    if len(bare) > MOST_LOST * len(images):
+        raise InputError(f"{folder / _POSES}: {len(bare)} of {len(images)} images have no pose there ({named(bare)})")
+    for image in images:
+        if image.name in bare:
+            continue
         c2w = _pose(poses, image.name, folder / _POSES / f"{image.stem}.txt")
         if c2w is None:
             continue
         frame = Frame(image.name, image, c2w, calibration, masks.of(image.name, image))
         everything.append(frame)
         frames.setdefault(_PREFIXES.get(image.name[:2], ""), []).append(frame)
-    said = poses.messages() + masks.messages(everything) + _without_image(folder)
+    without = [f"{len(bare)} of {len(images)} images have no pose in {_POSES}, and are left out: {named(bare)}"]
+    said = (without if bare else []) + poses.messages() + masks.messages(everything) + _without_image(folder)
     if not everything:
         raise InputError(f"{folder / _IMAGES}: expected images, but there are none")
     if "" in frames or "train" not in frames or len(frames) == 1:
@@ -63,18 +70,18 @@ def read(folder: Path, split: str) -> Listing:
 
 
 def _rows(path: Path) -> list[list[float]]:
-    """The numbers of a text file, line by line; empty lines drop out."""
+    """The numbers of a text file, line by line, with or without commas; empty lines drop out."""
     try:
-        rows = [[float(word) for word in line.split()] for line in read_text(path).splitlines()]
+        rows = [[float(word) for word in line.replace(",", " ").split()] for line in read_text(path).splitlines()]
     except ValueError:  # UnicodeDecodeError is one
         raise InputError(f"{path}: expected lines of numbers, got other text") from None
     return [row for row in rows if row]
 
 
 def _matrix(path: Path, rows: list[list[float]]) -> NDArray[np.float64]:
-    """A 4x4, 3x4 or 3x3 matrix from its rows, or a 4x4 one from 16 numbers in one."""
-    if len(rows) == 1 and len(rows[0]) == 16:
-        return np.array(rows[0]).reshape(4, 4)
+    """A 4x4, 3x4 or 3x3 matrix from its rows, or a square one from 16 or 9 numbers in one."""
+    if len(rows) == 1 and len(rows[0]) in (9, 16):
+        return np.array(rows[0]).reshape(4 if len(rows[0]) == 16 else 3, -1)
     shape = (len(rows), len(rows[0]) if rows else 0)
     if shape not in ((4, 4), (3, 4), (3, 3)) or any(len(row) != shape[1] for row in rows):
         raise InputError(
@@ -105,8 +112,6 @@ def _without_image(folder: Path) -> list[str]:
 
 
 def _pose(poses: Poses, listed: str, path: Path) -> NDArray[np.float64] | None:
-    if not path.is_file():
-        raise InputError(f"{path}: expected the pose of an image, but there is no such file")
     matrix = _matrix(path, _rows(path))
     try:
         matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes

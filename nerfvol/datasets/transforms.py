@@ -22,7 +22,7 @@ from nerfvol.region import check_box
 def recognises(path: Path) -> bool:
     """Whether the folder holds a transforms*.json this module reads, or is such a file itself."""
     names = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
-    return path.is_file() or any((path / name).is_file() for name in names)
+    return (path.is_file() and path.suffix.lower() == ".json") or any((path / name).is_file() for name in names)
 
 
 def read(path: Path, split: str) -> Listing:
@@ -63,6 +63,9 @@ def read(path: Path, split: str) -> Listing:
     own = read_files[used]
     train = read_files.get("train", own)
     messages += _unused(path, files, split) + own.messages
+    trained = {frame.path for frame in train.frames if frame.path is not None}
+    if own is not train and (both := sorted(f.listed for f in own.frames if f.path in trained)):
+        messages.append(f"{len(both)} views are trained on and held out too, so that scores flatter: {named(both)}")
     return Listing(own.frames, train.frames, own.path, train.hint, messages)
 
 
@@ -198,6 +201,9 @@ def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
     """nerfstudio's train_filenames, val_filenames and test_filenames, those that are there; ./ and \\ as frames have them."""
     by_name = {_plain(entry["file_path"]): entry["file_path"] for entry in data["frames"]
                if isinstance(entry, dict) and isinstance(entry.get("file_path"), str)}  # fmt: skip
+    by_end = {}
+    for name, listed in by_name.items():  # lists of bare names, where they tell
+        by_end[name.rpartition("/")[2]] = None if name.rpartition("/")[2] in by_end else listed
     by_stem = {name.rpartition(".")[0] or name: listed for name, listed in by_name.items()}
     found = {}
     for split in SPLITS:
@@ -207,7 +213,10 @@ def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(f"{path}: {split}_filenames must be a list of file names, got {shown(names):.60}")
         plain = [_plain(name) for name in names]
-        found[split] = {by_name.get(name) or by_stem.get(name.rpartition(".")[0] or name) or name for name in plain}
+        found[split] = {
+            by_name.get(name) or by_stem.get(name.rpartition(".")[0] or name) or by_end.get(name) or name
+            for name in plain
+        }
     return found
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -62,6 +63,31 @@ def _in_whole_rows(evaluate: Callable[..., Any]) -> Callable[..., Any]:
         return tuple(rows[:n] for rows in out) if isinstance(out, tuple) else out[:n]
 
     return padded
+
+
+class AtPoints:
+    """A field of torch in numpy, without gradients: ``nerfvol.field.layout.PointField``."""
+
+    def __init__(self, field: RadianceField) -> None:
+        self.field = field
+        self.has_sh = bool(getattr(field, "has_sh", False))
+
+    @torch.no_grad()
+    def __call__(self, positions: np.ndarray, viewdirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 3), (n, 3) unit -> sigma (n,) in 1/u, rgb (n, 3)."""
+        sigma, rgb = self.field(torch.from_numpy(positions), torch.tensor(viewdirs))
+        return sigma.numpy(), rgb.numpy()
+
+    @torch.no_grad()
+    def density(self, positions: np.ndarray) -> np.ndarray:
+        """(n, 3) -> sigma (n,) in 1/u."""
+        return self.field.density(torch.from_numpy(positions)).numpy()
+
+    @torch.no_grad()
+    def sh(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 3) -> sigma (n,), sh (n, 3, basis_dim), where ``has_sh``."""
+        sigma, sh = cast(SHField, self.field).sh(torch.from_numpy(positions))
+        return sigma.numpy(), sh.numpy()
 
 
 class _TruncatedExp(torch.autograd.Function):

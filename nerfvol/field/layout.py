@@ -9,7 +9,9 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+import numpy as np
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -66,6 +68,24 @@ class Domain:
         size = x.abs()
         bent = torch.where(size <= 1, x, x.sign() * (2 - 1 / size.clamp(min=1)))
         return (bent / (2 - 1 / self.outer)).clamp(-1, 1)
+
+
+class PointField(Protocol):
+    """A field at points, in numpy: what an octree is distilled from. ``has_sh``: it gives spherical harmonics."""
+
+    has_sh: bool
+
+    def __call__(self, positions: np.ndarray, viewdirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 3) scene positions and (n, 3) unit directions -> sigma (n,) >= 0 in 1/u, rgb (n, 3)."""
+        ...
+
+    def density(self, positions: np.ndarray) -> np.ndarray:
+        """(n, 3) -> sigma (n,)."""
+        ...
+
+    def sh(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 3) -> sigma (n,), sh (n, 3, (degree + 1)**2), where ``has_sh``."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
+from nerfvol.native import need_torch
 
 _FORMAT = "nerfvol checkpoint"
 _VERSION = 1
@@ -106,6 +107,7 @@ def _unpack(tree: Any, file: ArrayFile, depth: int) -> Any:
         case ["array", str(name)]:
             return file.read(name)
         case ["tensor", str(name)]:
+            need_torch(f"{file.path}, whose field was trained in torch,")
             import torch
 
             return torch.from_numpy(file.read(name))

@@ -1,4 +1,4 @@
-"""A compiled field with the space that it fills: what is drawn, and what distilling evaluates (``nerfvol.field.fields``)."""
+"""A compiled field with the space that it fills: what is drawn, and what distilling evaluates."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ import numpy as np
 
 from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_state import FieldState, Float, March
+from nerfvol.sh import eval_colour
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from nerfvol.cameras.camera import Camera
 
 
@@ -21,7 +20,7 @@ EARLY_STOP = 1e-3
 
 
 class CompiledField:
-    """A field that is empty where its occupancy grid says so, as it was in training; the protocol of ``SHField`` and more.
+    """A field that is empty where its occupancy grid says so, as it was in training; a PointField and more.
 
     The rest of it is whatever the network happens to hold in space that training skips. Points in skipped cells cost nothing.
     """
@@ -60,27 +59,19 @@ class CompiledField:
             raise ValueError("this field has a view-dependent rgb head: it has no SH coefficients to give")
         return field_ops.evaluate(self.state, positions, where=self.march, values=values)
 
-    def density(self, positions: Tensor) -> Tensor:
+    def density(self, positions: Float) -> Float:
         """(n, 3) -> sigma (n,) in 1/u."""
-        import torch
+        return self.evaluate(positions, values=False)[0]
 
-        return torch.from_numpy(self.evaluate(positions.numpy(), values=False)[0])
-
-    def sh(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def sh(self, positions: Float) -> tuple[Float, Float]:
         """(n, 3) -> sigma (n,), sh (n, 3, (sh_degree + 1)**2); ValueError unless the field has the SH head."""
-        import torch
+        sigma, values = self.evaluate(positions)
+        assert values is not None
+        return sigma, values
 
-        sigma, values = self.evaluate(positions.numpy())
-        return torch.from_numpy(sigma), torch.from_numpy(values)
-
-    def __call__(self, positions: Tensor, viewdirs: Tensor) -> tuple[Tensor, Tensor]:
+    def __call__(self, positions: Float, viewdirs: Float) -> tuple[Float, Float]:
         """(n, 3), (n, 3) unit -> sigma (n,), rgb (n, 3)."""
-        import torch
-
         if self.has_sh:
-            from nerfvol.sh import eval_colour
-
             sigma, sh = self.sh(positions)
             return sigma, eval_colour(sh, viewdirs)
-        sigma, rgb = field_ops.evaluate(self.state, positions.numpy(), viewdirs.numpy(), self.march)
-        return torch.from_numpy(sigma), torch.from_numpy(rgb)
+        return field_ops.evaluate(self.state, positions, np.ascontiguousarray(viewdirs), self.march)

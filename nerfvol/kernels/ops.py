@@ -37,6 +37,7 @@ from nerfvol.kernels.state import (
     from_squares,
 )
 from nerfvol.kernels.threads import (
+    WITHOUT_KERNELS,
     arena_bytes,
     available_isas,
     get_threads,
@@ -46,7 +47,7 @@ from nerfvol.kernels.threads import (
     set_threads,
 )
 from nerfvol.kernels.tree import kernel_batch, kernel_options, kernel_statistics, kernel_tree
-from nerfvol.native import native
+from nerfvol.native import native, need_torch
 from nerfvol.octree.tree import Octree
 
 __all__ = [
@@ -57,6 +58,7 @@ __all__ = [
 
 
 def _on_torch() -> ModuleType:
+    need_torch(WITHOUT_KERNELS)
     from nerfvol.kernels import on_torch
 
     return on_torch

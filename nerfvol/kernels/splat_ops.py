@@ -16,7 +16,8 @@ from nerfvol.defaults import WHITE
 from nerfvol.kernels.checks import check_background, check_early_stop, check_outputs
 from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatReport, SplatState, SplatView, view_of
 from nerfvol.kernels.state import OUTPUTS
-from nerfvol.native import aligned_empty, native
+from nerfvol.kernels.threads import WITHOUT_KERNELS
+from nerfvol.native import aligned_empty, native, need_torch
 from nerfvol.splats.packing import PackedSplats, as_packed, unpack
 from nerfvol.splats.splats import Splats
 
@@ -30,6 +31,7 @@ TILE = 16
 
 
 def _on_torch() -> ModuleType:
+    need_torch(WITHOUT_KERNELS)
     from nerfvol.kernels import splat_on_torch
 
     return splat_on_torch
@@ -81,6 +83,7 @@ def render_points(
     if packed.basis != 1:
         raise ValueError(f"points have one colour each, got spherical harmonics of degree {packed.sh_degree}")
     if native() is None:
+        need_torch(WITHOUT_KERNELS)
         from nerfvol.kernels.point_reference import render_surfaces
 
         drawn = render_surfaces(unpack(packed), view, bg, eps)

@@ -6,7 +6,9 @@ import os
 import sys
 
 from nerfvol.errors import InputError
-from nerfvol.native import native
+from nerfvol.native import native, need_torch
+
+WITHOUT_KERNELS = "drawing and training without compiled kernels"
 
 
 def set_threads(n: int) -> None:
@@ -15,6 +17,8 @@ def set_threads(n: int) -> None:
         raise ValueError(f"threads must be at least 1, got {n}")
     if (compiled := native()) is not None:
         compiled.set_threads(n)
+    if compiled is None:
+        need_torch(WITHOUT_KERNELS)
     if compiled is None or sys.modules.get("torch") is not None:
         import torch
 
@@ -26,6 +30,7 @@ def get_threads() -> int:
     compiled = native()
     if compiled is not None:
         return compiled.get_threads()
+    need_torch(WITHOUT_KERNELS)
     import torch
 
     return torch.get_num_threads()

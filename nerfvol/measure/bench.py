@@ -20,6 +20,7 @@ from nerfvol.cameras.camera import Camera, tile_pixels
 from nerfvol.defaults import DEFAULT_EARLY_STOP, WHITE
 from nerfvol.kernels import ops
 from nerfvol.measure import roofline
+from nerfvol.native import need_torch
 from nerfvol.octree import lod
 from nerfvol.octree.io import load_octree
 from nerfvol.octree.tree import Octree
@@ -145,10 +146,12 @@ def _batch(octree: Octree, camera: Camera, seed: int, n_tiles: int) -> ops.Batch
 
 def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[str, Any]) -> dict[str, Any]:
     """Rays a second of plain torch on the same octree, and of a network of the paper's size; ratios to the kernels."""
+    need_torch("the comparison with plain torch (--no-reference leaves it out)")
     import torch
 
     from nerfvol.config.training import FieldShape
-    from nerfvol.field.fields import Domain, make_field
+    from nerfvol.field.fields import make_field
+    from nerfvol.field.layout import Domain
     from nerfvol.kernels import on_torch, reference
 
     ops.set_threads(ops.get_threads())  # torch was loaded only now

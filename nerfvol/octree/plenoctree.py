@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
@@ -81,7 +80,7 @@ def _directions(degree: int) -> tuple[Float, Float]:
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(_DIRECTIONS)
     across = np.sqrt(1 - z * z)
     directions = np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=1)
-    values = eval_basis(degree, torch.from_numpy(directions)).numpy()
+    values = eval_basis(degree, directions)
     return values, np.linalg.pinv(values)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from nerfvol.rotations import product, quaternion
@@ -38,5 +37,5 @@ def sh_rotation(degree: int, rotation: Float) -> Float:
     z = 1 - (2 * np.arange(n) + 1) / n
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     d = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
-    before, after = (eval_basis(degree, torch.from_numpy(np.ascontiguousarray(v))).numpy() for v in (d, d @ rotation.T))
+    before, after = (eval_basis(degree, v) for v in (d, d @ rotation.T))
     return np.linalg.lstsq(after, before, rcond=None)[0]

@@ -11,12 +11,10 @@ from collections.abc import Callable
 from typing import cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nerfvol.config.training import DistillConfig
 from nerfvol.errors import InputError
-from nerfvol.field.fields import Domain, RadianceField
+from nerfvol.field.layout import Domain, PointField
 from nerfvol.native import native
 from nerfvol.octree.topology import OFFSETS
 
@@ -59,15 +57,14 @@ class Frame:
         return self.finest - shells.astype(np.int64)
 
 
-@torch.no_grad()
-def evaluate(function: Callable[[Tensor], Tensor], corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def evaluate(function: Callable[[np.ndarray], np.ndarray], corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """``function`` of the points corners (n, 3) + offsets (p, 3) or (n, p, 3), in one call: (n, p, ...) float32."""
     points = (corners[:, None] + offsets).astype(np.float32)
-    return function(torch.from_numpy(points.reshape(-1, 3))).numpy().reshape(*points.shape[:2], -1)
+    return function(points.reshape(-1, 3)).reshape(*points.shape[:2], -1)
 
 
 def candidate_cells(
-    field: RadianceField, frame: Frame, config: DistillConfig, messages: list[str]
+    field: PointField, frame: Frame, config: DistillConfig, messages: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Levels (n,) and positions (n, 3) of the cells that may hold something, at most ``config.max_leaves``.
 
@@ -104,7 +101,7 @@ def candidate_cells(
 
 
 def _search(
-    field: RadianceField, frame: Frame, start: int, threshold: float, most: int
+    field: PointField, frame: Frame, start: int, threshold: float, most: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Cells of an optical thickness above ``threshold`` and their neighbours, found from level ``start`` on; None: more
     than ``most``."""
@@ -128,9 +125,7 @@ def _search(
     return np.concatenate(levels), np.concatenate(done)
 
 
-def largest_sigma(
-    field: RadianceField, cells: np.ndarray, origin: np.ndarray, edge: float, per_axis: int
-) -> np.ndarray:
+def largest_sigma(field: PointField, cells: np.ndarray, origin: np.ndarray, edge: float, per_axis: int) -> np.ndarray:
     """Largest coefficient among per_axis**3 evenly spaced points in each cell: (n,) float32.
 
     Cells (n, 3), in units of their side ``edge``, begin at origin + cells * edge.

@@ -22,7 +22,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
-from nerfvol.field.fields import Domain, RadianceField
+from nerfvol.field.layout import Domain, PointField
 from nerfvol.machine import return_free_memory
 from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.octree.merge import merge_smooth
@@ -67,7 +67,7 @@ class DistillReport:
 
 
 def distill(
-    field: RadianceField,
+    field: PointField,
     domain: Domain,
     dataset: Dataset,
     background: Sequence[float],

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nerfvol import sh as spherical
-from nerfvol.field.fields import RadianceField, SHField
+from nerfvol.field.layout import PointField
 from nerfvol.octree.rows import DENSITY_SLOT, EMPTY_DENSITY, explin_inverse, sh_slots
 from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
@@ -21,7 +18,7 @@ THICKEST = 20.0
 _FAINT = 1e-6  # coefficient that colour counts with where there is none: empty space has its own colour, not 0 / 0
 
 
-def write_values(octree: Octree, field: RadianceField, samples_per_vertex: int = 8) -> None:
+def write_values(octree: Octree, field: PointField, samples_per_vertex: int = 8) -> None:
     """Fill an octree's vertices from a field.
 
     With 8 samples a vertex is the mean over the middles of the eight cells around it, of half the size of the finest
@@ -58,37 +55,36 @@ def finest_sides(octree: Octree) -> np.ndarray:
     return sides
 
 
-def sh_of(field: RadianceField, degree: int) -> Callable[[Tensor], Tensor]:
+def sh_of(field: PointField, degree: int) -> Callable[[np.ndarray], np.ndarray]:
     """Function from positions (n, 3) to rows (n, 1 + 3 * basis_dim): coefficient, then SH by channel."""
     dim = spherical.basis_dim(degree)
-    if getattr(field, "has_sh", False):
-        with_head = cast(SHField, field)
+    if field.has_sh:
 
-        def from_head(points: Tensor) -> Tensor:
-            sigma, sh = with_head.sh(points)
-            if sh.shape[-1] < dim:
-                sh = torch.nn.functional.pad(sh, (0, dim - sh.shape[-1]))
-            return torch.cat([sigma[:, None], sh[..., :dim].flatten(1)], dim=1)
+        def from_head(points: np.ndarray) -> np.ndarray:
+            sigma, sh = field.sh(points)
+            rows = np.zeros((len(points), 1 + 3 * dim), np.float32)
+            held = min(dim, sh.shape[-1])
+            rows[:, 0], rows[:, 1:].reshape(-1, 3, dim)[..., :held] = sigma, sh[..., :held]
+            return rows
 
         return from_head
     dirs, weights = _sphere(degree + 3)
-    projector = (weights[:, None] * spherical.eval_basis(degree, dirs)).float()
+    projector = (weights[:, None] * spherical.eval_basis(degree, dirs)).astype(np.float32)
 
-    def by_quadrature(points: Tensor) -> Tensor:
-        rows = points.new_zeros(len(points), 3, dim)
-        sigma = points.new_zeros(len(points))
-        for direction, row in zip(dirs.float(), projector, strict=True):
-            sigma, rgb = field(points, direction.expand_as(points))
-            rows += (rgb - 0.5)[..., None] * row
-        return torch.cat([sigma[:, None], rows.flatten(1)], dim=1)
+    def by_quadrature(points: np.ndarray) -> np.ndarray:
+        rows = np.zeros((len(points), 3, dim), np.float32)
+        sigma = np.zeros(len(points), np.float32)
+        for direction, row in zip(dirs.astype(np.float32), projector, strict=True):
+            sigma, rgb = field(points, np.broadcast_to(direction, points.shape))
+            rows += (rgb - np.float32(0.5))[..., None] * row
+        return np.concatenate([sigma[:, None], rows.reshape(len(points), -1)], axis=1)
 
     return by_quadrature
 
 
-def _sphere(n: int) -> tuple[Tensor, Tensor]:
+def _sphere(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions and weights of a product quadrature, exact for polynomials of degree < 2 n."""
     z, w = np.polynomial.legendre.leggauss(n)
     z, phi = (a.reshape(-1) for a in np.meshgrid(z, np.pi * np.arange(2 * n) / n, indexing="ij"))
     s = np.sqrt(1 - z * z)
-    dirs = np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1)
-    return torch.from_numpy(dirs), torch.from_numpy(np.repeat(w, 2 * n) * np.pi / n)
+    return np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1), np.repeat(w, 2 * n) * np.pi / n

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from nerfvol.errors import InputError
+from nerfvol.field.layout import Domain
 from nerfvol.kernels.state import StepReport
 
+if TYPE_CHECKING:
+    from nerfvol.region import SceneBounds
+
+NEAREST = 0.05
+"""Sample to a camera among photographs, in units of half the inner cube's edge."""
 FIELD_SHARE = 0.3
 """Of the time left in a run, the most that the field gets."""
 SECONDS_TO_DISTILL = 2.0
@@ -25,3 +35,24 @@ class FieldReport(StepReport):
     def psnr(self) -> float:
         """Of the batch, dB."""
         return -10 * math.log10(max(self.squared_error, 1e-12))
+
+
+def domain_of(scene: SceneBounds) -> Domain:
+    """The inner cube around the scene's bounds, and the background cube around it where there is one.
+
+    Raises:
+        InputError: the bounds are no box of positive, finite size.
+    """
+    aabb = np.asarray(scene.aabb, dtype=np.float64)
+    center, half = aabb.mean(0), float((aabb[1] - aabb[0]).max() / 2)
+    if not (math.isfinite(half) and half > 0):
+        raise InputError(f"the scene bounds must be a box of positive size, got {aabb.tolist()}")
+    outer = 1.0
+    if scene.is_unbounded:
+        outer = max(1.0, float(np.abs(np.asarray(scene.background_cube) - center).max() / half))
+    return Domain(tuple(center.tolist()), half, outer)
+
+
+def near_plane_of(domain: Domain) -> float:
+    """How near to a camera a field is looked at, u: cameras stand in the scene where it has a background."""
+    return NEAREST * domain.half if domain.outer > 1 else 0.0

@@ -16,66 +16,18 @@ from torch import Tensor
 
 from nerfvol.config.training import FieldConfig
 from nerfvol.errors import InputError
-from nerfvol.field.fields import NeuralField, RadianceField, make_field
-from nerfvol.field.layout import Domain
+from nerfvol.field.fields import AtPoints, RadianceField, make_field
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule
 from nerfvol.field.sampling import edges_of, intersect_aabb, inverse_cdf, step_generator, stratified
 from nerfvol.quadrature import Composite, accumulate, composite, composite_packed
-from nerfvol.training.compiled_field import CompiledFieldTrainer, compiled_refusal
-from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
+from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport, domain_of, near_plane_of
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
     from nerfvol.datasets.dataset import Dataset
-    from nerfvol.region import SceneBounds
-
-
-def domain_of(scene: SceneBounds) -> Domain:
-    """The inner cube around the scene's bounds, and the background cube around it where there is one.
-
-    Raises:
-        InputError: the bounds are no box of positive, finite size.
-    """
-    aabb = np.asarray(scene.aabb, dtype=np.float64)
-    center, half = aabb.mean(0), float((aabb[1] - aabb[0]).max() / 2)
-    if not (math.isfinite(half) and half > 0):
-        raise InputError(f"the scene bounds must be a box of positive size, got {aabb.tolist()}")
-    outer = 1.0
-    if scene.is_unbounded:
-        outer = max(1.0, float(np.abs(np.asarray(scene.background_cube) - center).max() / half))
-    return Domain(tuple(center.tolist()), half, outer)
-
 
 MOST_RAYS = 8192
 """Of one step, while most of space is known to be empty."""
-NEAREST = 0.05
-"""Sample to a camera among photographs, in units of half the inner cube's edge."""
-
-
-def make_field_trainer(
-    dataset: Dataset, config: FieldConfig, seed: int = 0, background: Sequence[float] = (1.0, 1.0, 1.0)
-) -> FieldTrainer | CompiledFieldTrainer:
-    """The trainer of a field that an octree is made of: by the compiled kernels where they can, else in torch; arguments as of
-    both."""
-    if compiled_refusal(config) is not None:
-        return FieldTrainer(dataset, config, seed, background)
-    domain = domain_of(dataset.scene)
-    return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain))
-
-
-def make_final_trainer(
-    dataset: Dataset, config: FieldConfig, seed: int, background: Sequence[float]
-) -> CompiledFieldTrainer:
-    """The trainer of a field that is the product; InputError where the kernels, which draw it later, cannot train it."""
-    if (refused := compiled_refusal(config)) is not None:
-        raise InputError(f"--representation field trains by the compiled kernels alone: {refused}")
-    domain = domain_of(dataset.scene)
-    return CompiledFieldTrainer(dataset, domain, config, seed, background, near_plane_of(domain), final=True)
-
-
-def near_plane_of(domain: Domain) -> float:
-    """How near to a camera a field is looked at, u: cameras stand in the scene where it has a background."""
-    return NEAREST * domain.half if domain.outer > 1 else 0.0
 
 
 class PixelBank:
@@ -280,9 +232,9 @@ class FieldTrainer:
         jitter = None if generator is None else torch.rand(len(rays_o), generator=generator)
         return self.grid.march(rays_o, rays_d, self.schedule, near_plane, jitter)
 
-    def trained_field(self) -> NeuralField | OccupiedField:
+    def trained_field(self) -> AtPoints:
         """The field without what it holds in space that training skips: what is to be rendered or distilled."""
-        return OccupiedField(self.field, self.grid) if self.config.sampler == "occupancy" else self.field
+        return AtPoints(OccupiedField(self.field, self.grid) if self.config.sampler == "occupancy" else self.field)
 
     def render(self, rays_o: Tensor, rays_d: Tensor, chunk: int = 4096) -> dict[str, Tensor]:
         """``render_field`` of the field as it is now: rgb (n, 3), opacity (n,), depth (n,).

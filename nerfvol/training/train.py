@@ -38,6 +38,7 @@ from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.compiled_field import CompiledFieldTrainer
+from nerfvol.training.field_start import make_field_trainer, make_final_trainer
 from nerfvol.training.memory import OctreePlan, field_memory, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
@@ -149,11 +150,8 @@ def begin_octree(run: Run) -> OctreeTrainer:
 
 def begin_field(run: Run) -> CompiledFieldTrainer:
     """The trainer of a field that is the product itself."""
-    from nerfvol.training.field_trainer import make_final_trainer
-
     config, dataset = run.config, run.data.training
     announce(run, field_memory(dataset, config.field, run.data.held_out_bytes))
-    ops.set_threads(ops.get_threads())  # torch was loaded only now
     return make_final_trainer(dataset, config.field, config.seed, run.background)
 
 
@@ -228,11 +226,10 @@ def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
 def start_from_field(run: Run) -> Octree:
     """Trains the field and distils it; the octree, and the scores of both among the run's results."""
     from nerfvol.starts.field import distill
-    from nerfvol.training.field_trainer import make_field_trainer
 
     config, background, data = run.config, run.background, run.data
-    ops.set_threads(ops.get_threads())  # torch was loaded only now
     field = make_field_trainer(data.training, config.field, config.seed, background)
+    ops.set_threads(ops.get_threads())  # torch may have been loaded only now
     optimise(run, field)
     run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
                             "MB": field.parameter_bytes / 1e6}  # fmt: skip

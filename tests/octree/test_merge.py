@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from nerfvol.octree.merge import _merge_errors, merge_smooth
 from nerfvol.starts.values import write_values
@@ -13,7 +12,7 @@ def test_merging_changes_nothing_where_the_field_is_trilinear() -> None:
     """A field that is linear in space merges to the coarsest leaves allowed, with the same values everywhere."""
 
     class Linear(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
+        def density(self, positions: np.ndarray) -> np.ndarray:
             return 300 + 100 * positions[:, 0] - 50 * positions[:, 1]
 
     octree = full_octree(4)

@@ -11,7 +11,7 @@ from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.config.training import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
-from nerfvol.field.fields import Domain
+from nerfvol.field.layout import Domain
 from nerfvol.octree.rows import explin
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
@@ -44,7 +44,7 @@ def black_views(n: int, size: int = 48) -> Dataset:
 def test_error_of_the_values_is_second_order(samples: int) -> None:
     """Halving the leaves divides the error of the coefficient by four; the linear colour is met at every size."""
     field, points, errors = Blob(), random_points(3000, 0.6), []
-    truth_sigma, truth_sh = (a.numpy() for a in field.sh(torch.from_numpy(points)))
+    truth_sigma, truth_sh = field.sh(points)
     levels = [3, 4, 5]
     for level in levels:
         octree = full_octree(level)
@@ -116,8 +116,8 @@ def test_neighbours_of_what_is_dense_are_candidates() -> None:
     """A cube of 2 x 2 x 2 leaves: it and the layer around it, in which its surface is interpolated."""
 
     class Cube(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
-            return torch.where((positions - CENTER).abs().max(-1).values < 1 / 16, 50.0, 0.0)
+        def density(self, positions: np.ndarray) -> np.ndarray:
+            return np.where(np.abs(positions - CENTER).max(-1) < 1 / 16, 50.0, 0.0)
 
     _, ijk = candidate_cells(Cube(), Frame.of(DOMAIN, 5), DistillConfig(level=5, coarse_level=3), [])
     assert len(ijk) == 4**3 and ijk.min() == 14 and ijk.max() == 17
@@ -167,8 +167,8 @@ def test_nothing_is_left_before_a_lens() -> None:
     """Of a field that is dense everywhere around photographs, what stands right before a camera goes."""
 
     class Everywhere(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
-            return torch.full((len(positions),), 0.3)
+        def density(self, positions: np.ndarray) -> np.ndarray:
+            return np.full(len(positions), 0.3)
 
     dataset = views(Everywhere(), 3)
     bounds = dataset.scene.aabb
@@ -187,7 +187,7 @@ def test_cells_are_searched_throughout() -> None:
     for axis in range(3):
 
         class Ramp(Blob):
-            def density(self, positions: torch.Tensor, axis: int = axis) -> torch.Tensor:
+            def density(self, positions: np.ndarray, axis: int = axis) -> np.ndarray:
                 return positions[:, axis] + 10
 
         np.testing.assert_allclose(
@@ -222,8 +222,8 @@ def test_leaves_grow_outside_the_detail() -> None:
     """With a background: full level inside the inner cube, one level less at each doubling of the distance."""
 
     class Everywhere(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
-            return torch.full((len(positions),), 5.0)
+        def density(self, positions: np.ndarray) -> np.ndarray:
+            return np.full(len(positions), 5.0)
 
     domain = Domain((0.0, 0.0, 0.0), 1.0, outer=4.0)
     frame = Frame.of(domain, 3)
@@ -281,7 +281,7 @@ def test_fields_without_an_sh_head_are_projected() -> None:
     class View(Blob):
         has_sh = False
 
-        def __call__(self, positions: torch.Tensor, viewdirs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        def __call__(self, positions: np.ndarray, viewdirs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             sigma, rgb = super().__call__(positions, viewdirs)
             return sigma, rgb + (viewdirs[:, :1] * viewdirs[:, 1:2])
 
@@ -296,12 +296,12 @@ def test_colour_in_front_of_a_surface_is_the_surfaces() -> None:
     """Averaging weighs colour by the coefficient: empty neighbours do not bleed in."""
 
     class Half(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
-            return torch.where(positions[:, 0] > CENTER[0], 100.0, 0.0)
+        def density(self, positions: np.ndarray) -> np.ndarray:
+            return np.where(positions[:, 0] > CENTER[0], 100.0, 0.0)
 
-        def sh(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            solid = (positions[:, 0] > CENTER[0]).float()
-            return self.density(positions), (solid - 0.5)[:, None, None].expand(-1, 3, 4)
+        def sh(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            solid = (positions[:, 0] > CENTER[0]).astype(np.float32)
+            return self.density(positions), np.broadcast_to((solid - 0.5)[:, None, None], (len(solid), 3, 4))
 
     octree = full_octree(3)
     write_values(octree, Half(), 8)

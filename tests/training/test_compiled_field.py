@@ -15,7 +15,8 @@ from nerfvol.kernels.field_state import FieldState
 from nerfvol.starts.field import distill
 from nerfvol.training import compiled_field
 from nerfvol.training.compiled_field import CompiledFieldTrainer, Pixels
-from nerfvol.training.field_trainer import FieldTrainer, make_field_trainer
+from nerfvol.training.field_start import make_field_trainer
+from nerfvol.training.field_trainer import FieldTrainer
 from tests.training.test_field_trainer import ball_dataset
 
 SMALL = FieldConfig(

@@ -15,7 +15,8 @@ from nerfvol.errors import InputError
 from nerfvol.field.sampling import intersect_aabb, step_generator
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.region import SceneBounds
-from nerfvol.training.field_trainer import FieldTrainer, PixelBank, domain_of, importance_samples, render_field
+from nerfvol.training.field_phase import domain_of
+from nerfvol.training.field_trainer import FieldTrainer, PixelBank, importance_samples, render_field
 
 TINY = FieldConfig(
     shape=FieldShape(width=16, hash_levels=4, hash_log2_table=10, hash_min=4, hash_max=24),

@@ -16,7 +16,7 @@ from nerfvol.measure.scores import evaluate
 from nerfvol.models import describe_file, load_model
 from nerfvol.neural import FieldModel
 from nerfvol.training.compiled_field import CompiledFieldTrainer
-from nerfvol.training.field_trainer import make_final_trainer
+from nerfvol.training.field_start import make_final_trainer
 from tests.fixtures.runs import TINY, metrics_of, settings, start
 from tests.training.test_field_trainer import ball_dataset
 
