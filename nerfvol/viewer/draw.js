@@ -198,6 +198,11 @@ class Drawing {
     this.shares = this.shares.map((share, i) => 0.7 * share + 0.3 * (speeds[i] / sum));
   }
 
+  // Only what lies in `box`, two corners in scene units; null: all. Pictures that are asked for afterwards show it.
+  crop(box) {
+    for (const worker of this.workers) worker.postMessage({ type: "crop", box });
+  }
+
   // A picture of its own, at any size: resolves to {buffer, floats}. output -1: floats alone.
   picture(camera, width, height, background, output = this.output, lod = FINE_LOD) {
     clearTimeout(this.timer);

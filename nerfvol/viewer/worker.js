@@ -1,7 +1,7 @@
 // A worker of a page: one copy of the model, which draws rows of the picture that the page asks for.
 "use strict";
 
-let engine = null, latest = -1;
+let engine = null, latest = -1, box = null;
 const clock = new MessageChannel();
 
 // Lets messages that wait be handled.
@@ -55,6 +55,7 @@ const handlers = {
     engine = null;  // the old one's memory goes first
     opened = false;
     engine = await Engine.open(module, bytes, parts.filter((name) => alone || name !== "nodes"));
+    engine.crop(box);
     if (!engine.lacks || alone) return ready();
     if (parts.includes("corners")) give("corners");
     if (engine.complete) ready();
@@ -75,6 +76,10 @@ const handlers = {
   async draw(job) {
     if (latest <= job.id && engine) await draw(job);
     else self.postMessage({ type: "dropped", id: job.id });
+  },
+  async crop(job) {
+    box = job.box;
+    if (engine) engine.crop(box);
   },
   async pick({ id, view, x, y }) {
     self.postMessage({ type: "picked", id, distance: engine ? engine.pick(view, x, y) : 0 });

@@ -16,11 +16,17 @@ struct {
     std::vector<int32_t> first_node, first_leaf, corners;
     std::vector<int16_t> codes;            // of the channels, one after the other
     Prefiltered nodes;
-    float* values = nullptr;
+    float* values = nullptr;               // one row more than there are vertices, an empty one
     Tree tree{};
+    struct Hidden {
+        int32_t* at;
+        int32_t corners[8];
+    };
+    std::vector<Hidden> hidden;            // what a crop box hides, and the corners it had
 } octree;
 
 constexpr int kDensity = 12;
+constexpr float kEmpty = -80;              // raw density that stops nothing
 
 // Masks to first children; 0, or the number of what is wrong (engine.js has the sentences).
 int find_children(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
@@ -40,27 +46,42 @@ int find_children(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n)
     return 0;
 }
 
-// Places the leaves and numbers their corners; 0, or the number of what is wrong.
-int number_leaves(const uint8_t* node_mask, const uint8_t* leaf_mask, int64_t n) {
-    const int64_t leaves = octree.tree.n_leaves;
-    std::vector<int8_t> level(static_cast<size_t>(leaves));
-    std::vector<int32_t> ijk(size_t(3 * leaves)), above = {0, 0, 0}, below;
-    int64_t leaf = 0;
+// Calls leaf(number, depth, place) and node(number, depth, place) for all below the root, breadth first; a place (3) counts cells of
+// that depth. False where it is deeper than kMaxLevel.
+template <class Leaf, class Node> bool walk(const Leaf& leaf, const Node& node) {
+    const Tree& t = octree.tree;
+    std::vector<int32_t> above = {0, 0, 0}, below;
+    int32_t leaves = 0, nodes = 1;
     int depth = 0;
-    for (int64_t start = 0, end = 1; start < n; start = end, end += int64_t(below.size()) / 3, above.swap(below)) {
-        if (++depth > kMaxLevel) return 3;
+    for (int64_t start = 0, end = 1; start < t.n_nodes; start = end, end += int64_t(below.size()) / 3, above.swap(below)) {
+        if (++depth > kMaxLevel) return false;
         below.clear();
-        for (int64_t node = start; node < end; ++node)
+        for (int64_t at = start; at < end; ++at)
             for (int o = 0; o < 8; ++o) {
-                const int32_t* p = above.data() + 3 * (node - start);
+                const int32_t* p = above.data() + 3 * (at - start);
                 const int32_t child[3] = {2 * p[0] + (o >> 2 & 1), 2 * p[1] + (o >> 1 & 1), 2 * p[2] + (o & 1)};
-                if (node_mask[node] >> o & 1) below.insert(below.end(), child, child + 3);
-                if (!(leaf_mask[node] >> o & 1)) continue;
-                level[size_t(leaf)] = int8_t(depth);
-                std::copy_n(child, 3, ijk.data() + 3 * leaf++);
+                if (t.node_mask[at] >> o & 1) {
+                    below.insert(below.end(), child, child + 3);
+                    node(nodes++, depth, child);
+                }
+                if (t.leaf_mask[at] >> o & 1) leaf(leaves++, depth, child);
             }
     }
-    return number_corners(level.data(), ijk.data(), leaves, depth, octree.corners.data()) == octree.tree.n_vertices ? 0 : 4;
+    return true;
+}
+
+// Places the leaves and numbers their corners; 0, or the number of what is wrong.
+int number_leaves() {
+    const int64_t leaves = octree.tree.n_leaves;
+    std::vector<int8_t> level(static_cast<size_t>(leaves));
+    std::vector<int32_t> ijk(size_t(3 * leaves));
+    int deepest = 0;
+    const bool fits = walk([&](int32_t leaf, int depth, const int32_t* place) {
+        level[size_t(leaf)] = int8_t(deepest = depth);
+        std::copy_n(place, 3, ijk.data() + 3 * int64_t(leaf));
+    }, [](int32_t, int, const int32_t*) {});
+    if (!fits) return 3;
+    return number_corners(level.data(), ijk.data(), leaves, deepest, octree.corners.data()) == octree.tree.n_vertices ? 0 : 4;
 }
 
 // Where coefficient k of channel c lies in a vertex row: nerfvol/octree/rows.py.
@@ -137,8 +158,10 @@ int octree_open(const uint8_t* node_mask, const uint8_t* leaf_mask, int32_t n_no
     t.origin[2] = z;
     t.size = size;
     t.density_scale = density_scale;
-    t.values = octree.values = lines<float>(16 * t.blocks * t.n_vertices);
-    std::fill_n(octree.values, 16 * t.blocks * t.n_vertices, 0.0f);
+    const int64_t numbers = 16 * t.blocks * t.n_vertices;
+    t.values = octree.values = lines<float>(numbers + 16 * t.blocks);
+    std::fill_n(octree.values, numbers + 16 * t.blocks, 0.0f);
+    octree.values[numbers + kDensity] = kEmpty;
     return 0;
 }
 
@@ -161,7 +184,7 @@ NERFVOL_WEB(octree_rows) void octree_rows(float density_step, float softness, fl
 
 // What takes long can be made by one instance and taken by others: corners here, values by octree_channel, nodes at last.
 NERFVOL_WEB(octree_corners) int octree_corners() {
-    return number_leaves(octree.tree.node_mask, octree.tree.leaf_mask, octree.tree.n_nodes);
+    return number_leaves();
 }
 
 NERFVOL_WEB(octree_nodes) void octree_nodes() {
@@ -185,8 +208,41 @@ NERFVOL_WEB(octree_part_bytes) uint32_t octree_part_bytes(int part) {
 
 // From now on nodes are drawn in place of their leaves where they are small.
 NERFVOL_WEB(octree_finish) void octree_finish() {
+    const size_t numbers = octree.nodes.values.size();
+    octree.nodes.values.resize(numbers + 16 * size_t(octree.tree.blocks));  // an empty row
+    octree.nodes.values[numbers + kDensity] = kEmpty;
     octree.tree.node_corners = octree.nodes.corners.data();
     octree.tree.node_values = octree.nodes.values.data();
+}
+
+// Draws only leaves whose middle lies in the box of corners low and high, scene units, and nodes that reach into it: as
+// nerfvol export --crop.
+NERFVOL_WEB(octree_crop) void octree_crop(float x0, float y0, float z0, float x1, float y1, float z1) {
+    const Tree& t = octree.tree;
+    for (const auto& one : octree.hidden) std::copy_n(one.corners, 8, one.at);
+    octree.hidden.clear();
+    const float low[3] = {x0, y0, z0}, high[3] = {x1, y1, z1};
+    const auto hide = [](int32_t* at, int64_t empty) {
+        octree.hidden.push_back({at, {}});
+        std::copy_n(at, 8, octree.hidden.back().corners);
+        std::fill_n(at, 8, int32_t(empty));
+    };
+    // Whether a cell from `margin` inside its faces on is outside the box.
+    const auto outside = [&](int depth, const int32_t* place, float margin) {
+        const float side = t.size / float(1 << depth);
+        bool out = false;
+        for (int k = 0; k < 3; ++k) {
+            const float from = t.origin[k] + side * (float(place[k]) + margin), to = t.origin[k] + side * (float(place[k]) + 1 - margin);
+            out |= to < low[k] || from > high[k];
+        }
+        return out;
+    };
+    const int64_t empty_node = int64_t(octree.nodes.values.size()) / (16 * t.blocks) - 1;
+    walk([&](int32_t leaf, int depth, const int32_t* place) {
+        if (outside(depth, place, 0.5f)) hide(octree.corners.data() + 8 * int64_t(leaf), t.n_vertices);
+    }, [&](int32_t node, int depth, const int32_t* place) {
+        if (t.node_corners && outside(depth, place, 0.0f)) hide(octree.nodes.corners.data() + 8 * int64_t(node), empty_node);
+    });
 }
 
 // ------------------------------------------------------------------ drawing

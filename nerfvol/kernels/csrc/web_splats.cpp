@@ -15,6 +15,7 @@ struct {
     Splats splats{};
     double origin[3], near, low[3], high[3];
     SplatView view{};
+    std::vector<float> logits;             // as they were before a crop box
 } gaussians;
 
 SplatView splat_view() {
@@ -114,6 +115,25 @@ NERFVOL_WEB(splats_finish) void splats_finish(float x, float y, float z, float s
             for (int k = 0; k < 3; ++k) c[k] = at(kSh + s.basis * k + b);
             for (int k = 0; k < 3; ++k) at(kSh + s.basis * k + b) = kFromGrey[0][k] * c[0] + kFromGrey[1][k] * c[1] + kFromGrey[2][k] * c[2];
         }
+    }
+}
+
+// Draws only splats whose mean lies in the box of corners low and high, scene units.
+NERFVOL_WEB(splats_crop) void splats_crop(float x0, float y0, float z0, float x1, float y1, float z1) {
+    const Splats& s = gaussians.splats;
+    const float low[3] = {x0, y0, z0}, high[3] = {x1, y1, z1};
+    const bool first = gaussians.logits.empty();
+    if (first) gaussians.logits.resize(size_t(s.n));
+    for (int64_t i = 0; i < s.n; ++i) {
+        float* const p = gaussians.params + i / 16 * s.rows() * 16 + i % 16;
+        float& kept = gaussians.logits[size_t(i)];
+        if (first) kept = p[16 * kLogit];
+        bool inside = true;
+        for (int k = 0; k < 3; ++k) {
+            const float x = p[16 * (kMean + k)] + float(gaussians.origin[k]);
+            inside &= x >= low[k] && x <= high[k];
+        }
+        p[16 * kLogit] = inside ? kept : -60.0f;
     }
 }
 
