@@ -48,7 +48,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--time-budget", metavar="TIME", help="train the result on the images for so long, such as 25s "
                    "(default: not at all)")  # fmt: skip
     p.add_argument("--level", metavar="L", help="octree: finest leaves, 2^L along the scene (default: 1.4 pixels wide)")
-    p.add_argument("--max-splats", metavar="N", help="splats: at most so many (default: 100000)")
+    p.add_argument("--max-splats", metavar="N", help="splats: at most so many: the finest level of the octree that has no more, "
+                   "or, where they are trained, discs on what is seen (default: all visible leaves; 100000 discs)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B (default: that of the training)")
     p.add_argument(
         "--storage", metavar="compact|float16|float32", help="octree: how its file holds values (default: compact)"
@@ -107,6 +108,7 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
     from nerfvol.clouds import PointModel
     from nerfvol.config.training import Config
     from nerfvol.neural import FieldModel
+    from nerfvol.starts.gaussians import splats_of_leaves
     from nerfvol.training import convert
     from nerfvol.views import OctreeModel, SplatModel
 
@@ -121,6 +123,9 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
     }
     if options.to == "splats" and not isinstance(model, OctreeModel | FieldModel):
         raise InputError(f"{target.path} holds {model.kind}, and splats are made of an octree or a field alone")
+    trained = training is not None and options.time_budget is not None
+    if options.to == "splats" and isinstance(model, OctreeModel) and not trained:
+        return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
     seen = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, SplatModel | PointModel):
         octree = convert.octree_of(model.splats, seen, background, options.level, options.seed)
@@ -135,10 +140,10 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
             return OctreeModel(octree, metadata)
         model = OctreeModel(octree, metadata)
     assert isinstance(model, OctreeModel)
-    splats = convert.splats_of(model.octree, seen, background, options.max_splats or convert.MOST_SPLATS)
-    if training is None or options.time_budget is None:
-        return SplatModel(splats, metadata)
-    tuned = convert.tuned_splats(splats, training, background, config)
+    if training is None or not trained:
+        return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
+    discs = convert.discs_of(model.octree, seen, background, options.max_splats)
+    tuned = convert.tuned_splats(discs, training, background, config)
     return SplatModel(tuned.packed, {**metadata, **tuned.metadata})
 
 

@@ -105,7 +105,9 @@ def _run_viewed(config: Config) -> int:
     try:
         announce(server, True)
         server.start()
+        shown.training = True
         results = train(config, watch=live)
+        shown.training = False
         if results is not None:
             print_results(results)
             live.join()

@@ -19,6 +19,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nerfvol import __version__
 from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.cameras.paths import default_orbit, orbit_cameras
@@ -35,7 +37,7 @@ POSTER_SIZE = (1120, 630)
 POSTER_BYTES = 60_000
 ENGINE = ("engine.js", "worker.js")
 REMOTE = "remote.js"
-PAGE = ("engine.js", "camera.js", "draw.js", "view.js")
+PAGE = ("engine.js", "camera.js", "draw.js", REMOTE, "view.js", "path.js")
 
 
 def memory(model: Model, max_bytes: int | None = None) -> int:
@@ -88,7 +90,7 @@ def page_settings(model: Model, name: str) -> dict[str, Any]:
     cameras = orbit_cameras(4, orbit, (96, 96))
     return {
         "name": name, "orbit": orbit, "background": list(model.metadata.get("background", WHITE)),
-        "depths": list(depth_range(model, cameras)),
+        "depths": list(depth_range(model, cameras)), "box": np.asarray(model.aabb(), float).tolist(),
     }  # fmt: skip
 
 
@@ -116,8 +118,7 @@ def poster(model: Model, settings: Mapping[str, Any]) -> str:
 
 def build_page(settings: Mapping[str, Any], poster_address: str, model: bytes | None) -> str:
     """The page's text. model: the file in it, compact; None: it comes from the page's server (viewer/server.py)."""
-    before, last = PAGE[:-1], PAGE[-1]
-    names = (*before, last) if model is not None else (*before, REMOTE, last)
+    names = [name for name in PAGE if name != REMOTE or model is None]
     script = "const remote = null;\n" if model is not None else ""
     script += "\n".join(resource(name).decode().replace('"use strict";', "") for name in names)
     script = f'"use strict";\n{script}'

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from nerfvol.export.leaves import splats_of_leaves
+from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.export.part import Up, turn_to
 from nerfvol.models import Model
 from nerfvol.splats.ply import save_ply

@@ -1,4 +1,5 @@
-"""Surfels of an octree: Gaussians that lie flat on what its views see, to train or to draw instead of its leaves.
+"""Surfels of an octree: Gaussians that lie flat on what its views see, for a training of splats to begin with. To be drawn as
+they are its leaves do better (starts/gaussians.py).
 
 A visible leaf becomes a disc: across the gradient of the density, as wide as the leaf, of its colour's spherical harmonics as
 they are. Eight cells whose colours and normals agree become one disc of twice the width, again and again, so that plain

@@ -1,9 +1,10 @@
 """One representation from another: splats or a field become an octree, an octree or a field splats, and what that cost is
 measured.
 
-Geometry first (starts/leaves.py, starts/surfels.py), from the model alone. An octree of splats is then fitted to pictures of
-them, since Gaussians that overlap are no sum of densities: no photograph is needed for it. Either may be trained further on
-the photographs themselves.
+Geometry first, from the model alone: leaves around splats (starts/leaves.py), an octree's leaves as Gaussians
+(starts/gaussians.py). An octree of splats is then fitted to pictures of them, since Gaussians that overlap are no sum of
+densities: no photograph is needed for it. Either may be trained further on the photographs themselves, splats from discs on
+what is seen (starts/surfels.py).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import SplatModel
 
-MOST_SPLATS = 100_000
+MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
 FITTED_VIEWS = 100
 """Pictures of the splats that their octree is fitted to, at most."""
@@ -140,13 +141,13 @@ def octree_of_field(
     return frame.octree_back(octree)
 
 
-def splats_of(octree: Octree, seen: Dataset, background: Sequence[float], most: int | None = None) -> Splats:
-    """The surfels of what ``seen``'s cameras see of an octree.
+def discs_of(octree: Octree, seen: Dataset, background: Sequence[float], most: int | None = None) -> Splats:
+    """The surfels of what ``seen``'s cameras see of an octree, at most ``most`` (MOST_DISCS): what a training begins with.
 
     Raises:
         InputError: they see none of it.
     """
-    return surfels(octree, largest_weights(octree, seen, background, judged_downscale(seen)), most)
+    return surfels(octree, largest_weights(octree, seen, background, judged_downscale(seen)), most or MOST_DISCS)
 
 
 def tuned_octree(

@@ -69,6 +69,10 @@ class Clock:
         """Seconds so far, those of earlier sessions included."""
         return time.perf_counter() - self._zero
 
+    def exclude(self, seconds: float) -> None:
+        """So many of the last seconds do not count: the run stood still."""
+        self._zero += seconds
+
 
 def read_saved(path: Path) -> dict[str, Any]:
     """The state in a run's checkpoint, with everything that a continuation looks up in it.

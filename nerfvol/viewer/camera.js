@@ -87,6 +87,14 @@ function ray(camera, x, y, width, height) {
   return sub(add(scale(right, (x - width / 2) / f), scale(up, -(y - height / 2) / f)), back);
 }
 
+// Where a point is in a picture, [x, y]; null: behind the camera.
+function project(camera, point, width, height) {
+  const [right, up, back] = axes(camera.rotation), d = sub(point, camera.position), depth = -dot(d, back);
+  if (!(depth > 1e-9)) return null;
+  const f = focal(camera, width, height);
+  return [width / 2 + (f * dot(d, right)) / depth, height / 2 - (f * dot(d, up)) / depth];
+}
+
 // Around the pivot: `yaw` about the scene's up, `pitch` about the camera's right; the poles are kept at a distance.
 function orbited(camera, yaw, pitch, up) {
   const [right, , back] = axes(camera.rotation), height = Math.asin(clamp(dot(back, up), -1, 1)), most = 1.55;
@@ -201,4 +209,4 @@ function pathDocument(keys, loop, fps, width, height) {
 }
 
 if (typeof module !== "undefined")
-  module.exports = { orbitCamera, matrix, fromMatrix, orbited, panned, zoomed, flown, toFragment, fromFragment, pathCamera, pathDocument, focal, pathSeconds };
+  module.exports = { project, orbitCamera, matrix, fromMatrix, orbited, panned, zoomed, flown, toFragment, fromFragment, pathCamera, pathDocument, focal, pathSeconds };

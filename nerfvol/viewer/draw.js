@@ -32,26 +32,41 @@ class Drawing {
     URL.revokeObjectURL(url);
   }
 
-  // The model in `bytes`, now. Of an octree the first worker numbers the corners while the second decodes the values; the first then
-  // makes the nodes of coarser levels while the others draw already.
+  // The model in `bytes`, now; resolves once pictures of it can be drawn. Of an octree the first worker numbers the corners while the
+  // second decodes the values. The second then draws, and gives the values to the others, who join as they have them; the first
+  // makes the nodes of coarser levels before it does.
   async load(module, bytes) {
-    const n = this.workers.length, shared = n > 1 && !this.isSplats;
+    const n = this.workers.length, shared = n > 1 && !this.isSplats, [maker, painter] = this.workers;
     const parts = this.workers.map((_, i) => (!shared ? ["corners", "values", "nodes"] : [["corners"], ["values"]][i] || []));
+    const edition = (this.edition = (this.edition || 0) + 1);
     this.frame = null;
-    this.active = shared ? this.workers.slice(1) : [...this.workers];
-    const relay = (from, data) => this.workers.forEach((worker, i) => i !== from && worker.postMessage({ ...data, type: "take" }));
-    await Promise.all(this.workers.map((worker, index) => new Promise((resolve) => {
+    this.active = [];
+    this.loading = true;
+    const ready = this.workers.map((worker, index) => new Promise((resolve) => {
       worker.onmessage = ({ data }) => {
-        if (data.type === "opened") return resolve();
-        if (data.type !== "part") return this.hear(worker, data);
-        performance.mark(data.name);
-        relay(index, data);
-        if (data.name === "nodes") this.active = [...this.workers];
+        if (data.edition && data.edition !== edition) return;  // of the model before
+        if (data.type === "part") return this.relay(worker, data);
+        if (data.type !== "opened") return this.hear(worker, data);
+        if (worker === maker && shared) worker.postMessage({ type: "nodes", edition });
+        else this.active.push(worker);
+        resolve();
       };
       worker.onerror = (event) => this.onFault(`The model cannot be drawn: ${event.message || "a worker did not start"}.`);
-      worker.postMessage({ type: "open", module, bytes, parts: parts[index], alone: !shared });
-    })));
-    if (shared) this.workers[0].postMessage({ type: "nodes" });
+      worker.postMessage({ type: "open", edition, module, bytes, parts: parts[index], alone: !shared });
+    }));
+    await (shared ? ready[1] : Promise.all(ready));
+    if (edition !== this.edition) return;
+    this.loading = false;
+    if (shared) setTimeout(() => painter.postMessage({ type: "give", edition, name: "values" }));  // after the picture that is asked for now
+  }
+
+  // A part of the octree from one worker to the others; the last one has the buffers themselves.
+  relay(from, { edition, name, buffers }) {
+    performance.mark(name);
+    const others = this.workers.filter((worker) => worker !== from), last = others.pop();
+    for (const worker of others) worker.postMessage({ type: "take", edition, name, buffers });
+    last.postMessage({ type: "take", edition, name, buffers }, buffers);
+    if (name === "nodes") this.active.push(from);
   }
 
   // Whether every worker draws, coarser levels among what they draw.
@@ -75,6 +90,7 @@ class Drawing {
   request(camera, background, at = performance.now()) {
     this.wanted = { camera, background, at };
     clearTimeout(this.timer);
+    if (this.loading) return;
     if (this.frame && this.frame.moving) return void (this.pending = true);
     this.start(true);
   }
@@ -180,6 +196,11 @@ class Drawing {
     if (!this.isSplats || frame.workerMs.some((x) => !x)) return;
     const speeds = this.shares.map((share, i) => share / frame.workerMs[i]), sum = speeds.reduce((a, b) => a + b);
     this.shares = this.shares.map((share, i) => 0.7 * share + 0.3 * (speeds[i] / sum));
+  }
+
+  // Only what lies in `box`, two corners in scene units; null: all. Pictures that are asked for afterwards show it.
+  crop(box) {
+    for (const worker of this.workers) worker.postMessage({ type: "crop", box });
   }
 
   // A picture of its own, at any size: resolves to {buffer, floats}. output -1: floats alone.

@@ -113,8 +113,18 @@ class Engine {
   }
 
   makeNodes() {
+    const box = this.box;
+    this.crop(null);  // nodes are made of all leaves
     this.wasm.octree_nodes();
     this.wasm.octree_finish();
+    this.crop(box);
+  }
+
+  // Draws what lies in the box of corners box[0] and box[1], scene units, and nothing else; null: all.
+  crop(box) {
+    const corners = box ? box.flat() : [-1, -1, -1, 1, 1, 1].map((x) => x * 1e30), before = this.box;
+    this.box = box;
+    if (this.complete && (box || before)) this.wasm[this.isSplats ? "splats_crop" : "octree_crop"](...corners);
   }
 
   // A copy of a part of the octree, for others to take: a list of buffers.
@@ -133,6 +143,7 @@ class Engine {
     });
     this.lacks.delete(name);
     if (name === "nodes") this.wasm.octree_finish();
+    if (this.complete) this.crop(this.box);
   }
 
   openSplats(file) {

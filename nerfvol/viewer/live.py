@@ -32,7 +32,15 @@ class Live:
         self._last, self._due = -float("inf"), False
 
     def __call__(self, run: Run, phase: Phase, began_stage: bool) -> None:
-        """After a step: publishes where it is time to, and the last edition is out."""
+        """After a step: publishes where it is time to, and the last edition is out; then waits as long as somebody who looks
+        has paused the training, which is no training time."""
+        self._publish(run, phase, began_stage)
+        if self.shown.paused:
+            started = time.perf_counter()
+            self.shown.wait_while_paused(lambda: run.interrupted)
+            run.clock.exclude(time.perf_counter() - started)
+
+    def _publish(self, run: Run, phase: Phase, began_stage: bool) -> None:
         self._due |= began_stage or time.monotonic() - self._last >= self.every
         if not self._due or (self._thread is not None and self._thread.is_alive()):
             return

@@ -114,7 +114,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """What starts work."""
-        self._answer({"/render": self._render, "/stop": self._stop})
+        self._answer({"/render": self._render, "/stop": self._stop, "/pause": self._pause})
 
     def _answer(self, routes: dict[str, Any]) -> None:
         url = urlsplit(self.path)
@@ -180,10 +180,12 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, edition.data, "application/octet-stream", headers)
 
     def _state(self) -> None:
-        edition = self.server.shown.wait(self._number("version"), POLL_SECONDS)
-        self._json(
-            {"version": edition.version, "sentence": edition.sentence} if edition else {"version": 0, "sentence": ""}
-        )
+        self.server.shown.wait(self._number("version"), POLL_SECONDS)
+        self._json(self.server.shown.state())
+
+    def _pause(self) -> None:
+        self.server.shown.pause(self._number("on") == 1)
+        self._json(self.server.shown.state())
 
     # ------------------------------------------------------------------ photographs
     def _cameras(self) -> None:

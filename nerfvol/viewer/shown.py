@@ -6,6 +6,7 @@ import io
 import math
 import tempfile
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ class Shown:
         self._edition: Edition | None = None
         self._changed = threading.Condition()
         self._drawing = threading.Lock()
+        self.training, self.paused = False, False
 
     @property
     def edition(self) -> Edition | None:
@@ -74,6 +76,25 @@ class Shown:
         with self._changed:
             self._changed.wait_for(lambda: self._edition is not None and self._edition.version > version, seconds)
             return self._edition
+
+    # ------------------------------------------------------------------ a training that is looked at
+    def pause(self, paused: bool) -> None:
+        """Lets the training stand still after its present step, or go on; without one, nothing."""
+        with self._changed:
+            self.paused = paused and self.training
+            self._changed.notify_all()
+
+    def wait_while_paused(self, stopped: Callable[[], bool]) -> None:
+        """Until nobody pauses any more, or ``stopped()``, which is asked every fifth of a second."""
+        with self._changed:
+            while self.paused and not stopped():
+                self._changed.wait(0.2)
+
+    def state(self) -> dict[str, Any]:
+        """Version and sentence of the present edition, whether a training is on its way and whether it is paused; JSON-able."""
+        edition = self._edition
+        version, sentence = (edition.version, edition.sentence) if edition else (0, "")
+        return {"version": version, "sentence": sentence, "training": self.training, "paused": self.paused}
 
     # ------------------------------------------------------------------ photographs
     def cameras(self) -> list[dict[str, Any]]:

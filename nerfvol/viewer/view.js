@@ -60,7 +60,7 @@ async function open() {
   changed();
   if (!remote) return;
   const distance = (m) => Math.max(norm(sub([m[0][3], m[1][3], m[2][3]], first.pivot)), 1e-6);
-  remote.build($("remote"), { look, path: pathNow, distance }).catch((error) => fault(error.message));
+  remote.build($("remote"), { look, path: pathNow, distance, camera: () => state.camera, extent }).catch((error) => fault(error.message));
   remote.follow(async (newer) => {
     drawing.isSplats = readArrays(newer).document.format === "nerfvol splats";
     model = newer;
@@ -82,6 +82,7 @@ function shown(frame) {
 let fragment = null;
 function changed() {
   if (!drawing || failed) return;
+  remote?.moved?.();
   drawing.request(state.camera, state.background);
   clearTimeout(fragment);
   fragment = setTimeout(() => {
@@ -107,8 +108,10 @@ function dragged(dx, dy, pan) {
   look(pan ? panned(state.camera, dx, dy, width, height) : orbited(state.camera, -dx * turns, -dy * turns, up));
 }
 
+let pressed = null;  // where a pointer went down that has not moved
 canvas.addEventListener("pointerdown", (event) => {
   stop();
+  pressed = place(event);
   canvas.focus({ preventScroll: true });
   try { canvas.setPointerCapture(event.pointerId); } catch { /* a pointer that is gone already */ }
   pointers.set(event.pointerId, place(event));
@@ -118,11 +121,13 @@ canvas.addEventListener("pointermove", (event) => {
   if (!before) return;
   pointers.set(event.pointerId, now);
   const [dx, dy] = sub(now, before);
+  if (pressed && norm(sub(now, pressed)) > 3) pressed = null;
   if (pointers.size === 1) return dragged(dx, dy, event.buttons & 6 || event.shiftKey);
   const other = [...pointers].find(([id]) => id !== event.pointerId)[1], apart = (p) => Math.hypot(...sub(p, other)) + 1;
   const [width, height] = extent(), middle = scale(add(now, other), 0.5);
   look(panned(zoomed(state.camera, apart(before) / apart(now), ...middle, width, height), dx / 2, dy / 2, width, height));
 });
+canvas.addEventListener("pointerup", (event) => pressed && remote?.clicked?.(...place(event)));
 for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => pointers.delete(event.pointerId));
 canvas.addEventListener("contextmenu", (event) => event.preventDefault());
 canvas.addEventListener("wheel", (event) => {
@@ -225,74 +230,12 @@ $("save").onclick = async () => {
 };
 $("file").onclick = () => download(new Blob([model], { type: "application/octet-stream" }), `${settings.name}.safetensors`);
 
-// ------------------------------------------------------------------ the camera path
-const looped = () => $("loop").checked;
-function addKey() {
-  state.keys.push({ camera: structuredClone(state.camera), seconds: 2 });
-  list();
-}
-function list() {
-  $("keys").replaceChildren(...state.keys.map((key, i) => {
-    const item = document.createElement("li");
-    const button = (text, label, act) => {
-      const b = Object.assign(document.createElement("button"), { type: "button", textContent: text, onclick: () => (act(), list()) });
-      b.setAttribute("aria-label", `${label} ${i + 1}`);
-      item.append(b);
-    };
-    const swap = (j) => { if (state.keys[j]) [state.keys[i], state.keys[j]] = [state.keys[j], state.keys[i]]; };
-    button(`View ${i + 1}`, "Go to view", () => look(structuredClone(key.camera)));
-    const seconds = Object.assign(document.createElement("input"), { type: "number", min: 0.1, step: 0.1, value: key.seconds });
-    seconds.setAttribute("aria-label", `Seconds after view ${i + 1}`);
-    seconds.onchange = () => (key.seconds = clamp(Number(seconds.value) || 2, 0.1, 600));
-    item.append(seconds);
-    button("↑", "Earlier: view", () => swap(i - 1));
-    button("↓", "Later: view", () => swap(i + 1));
-    button("⟳", "Replace by what is seen: view", () => (key.camera = structuredClone(state.camera)));
-    button("×", "Remove view", () => state.keys.splice(i, 1));
-    return item;
-  }));
-}
-function stop() {
-  state.playing = null;
-  $("play").textContent = "Play";
-}
-function play() {
-  if (state.playing || !state.keys.length) return stop();
-  const playing = (state.playing = { started: performance.now() });
-  $("play").textContent = "Stop";
-  const step = () => {
-    if (state.playing !== playing) return;
-    const total = pathSeconds(state.keys, looped()), seconds = (performance.now() - playing.started) / 1000;
-    if (!looped() && seconds >= total) stop();
-    look(pathCamera(state.keys, looped() ? seconds % Math.max(total, 1e-3) : Math.min(seconds, total), looped()));
-    requestAnimationFrame(step);
-  };
-  step();
-}
-const pathNow = () => pathDocument(state.keys, looped(), clamp(Number($("fps").value) || 30, 1, 120), Number($("width").value) || 1200, Number($("height").value) || 800);
-$("add").onclick = addKey;
-$("play").onclick = play;
-$("store").onclick = () => state.keys.length ? download(new Blob([JSON.stringify(pathNow())], { type: "application/json" }), "path.json") : (status.textContent = "Add a view first");
-$("load").onclick = () => $("paths").click();
-$("paths").onchange = async () => {
-  try { readPath(JSON.parse(await $("paths").files[0].text())); } catch { status.textContent = "This is no camera path"; }
-};
-function readPath(document_) {
-  const distance = norm(sub(first.position, first.pivot)), w = document_.w || 1200, h = document_.h || w;
-  state.keys = document_.keyframes || document_.frames.map((frame) => {
-    const focal_ = frame.fl_x || document_.fl_x || (0.5 * w) / Math.tan((frame.camera_angle_x || document_.camera_angle_x || 0.6911) / 2);
-    return { camera: fromMatrix(frame.transform_matrix, 2 * Math.atan((0.5 * Math.min(w, h)) / focal_), distance), seconds: 0.5 };
-  });
-  $("loop").checked = Boolean(document_.loop);
-  list();
-}
-
 // What tests and notebooks ask.
 window.nerfvol = {
   get camera() { return structuredClone(state.camera); },
   set camera(camera) { look(camera); },
   get drawing() { return drawing; },
   get path() { return pathNow(); },
-  first, state, readPath,
+  first, state, readPath, crop,
 };
 window.nerfvol.ready = open().catch((error) => fault(error instanceof ModelError ? error.message : `This page cannot be shown: ${error.message}`));

@@ -1,7 +1,7 @@
 // A worker of a page: one copy of the model, which draws rows of the picture that the page asks for.
 "use strict";
 
-let engine = null, latest = -1;
+let engine = null, latest = -1, box = null;
 const clock = new MessageChannel();
 
 // Lets messages that wait be handled.
@@ -35,40 +35,51 @@ async function draw(job) {
   self.postMessage({ type: "done", id, ms: performance.now() - started, depths, strips, floats }, all);
 }
 
-let opened = false;
+let opened = false, edition = 0;
 function ready() {
-  if (!opened) self.postMessage({ type: "opened", bytes: engine.wasm.memory.buffer.byteLength });
+  if (!opened) self.postMessage({ type: "opened", edition, bytes: engine.wasm.memory.buffer.byteLength });
   opened = true;
 }
 
 function give(name) {
   const buffers = engine.part(name);
-  self.postMessage({ type: "part", name, buffers }, buffers);
+  self.postMessage({ type: "part", edition, name, buffers }, buffers);
 }
 
 let queue = Promise.resolve();
 
 const handlers = {
   // Several workers share the work: each makes `parts` of an octree and sends them to the others, by way of the page.
-  async open({ module, bytes, parts, alone }) {
+  async open({ module, bytes, parts, alone, ...job }) {
+    edition = job.edition;
     engine = null;  // the old one's memory goes first
     opened = false;
     engine = await Engine.open(module, bytes, parts.filter((name) => alone || name !== "nodes"));
+    engine.crop(box);
     if (!engine.lacks || alone) return ready();
-    for (const name of parts) if (name !== "nodes") give(name);
+    if (parts.includes("corners")) give("corners");
     if (engine.complete) ready();
   },
-  async take({ name, buffers }) {
+  async give({ name, ...job }) {
+    if (job.edition === edition) give(name);
+  },
+  async take({ name, buffers, ...job }) {
+    if (job.edition !== edition) return;
     engine.take(name, buffers);
     if (engine.complete) ready();
   },
-  async nodes() {
+  async nodes(job) {
+    if (job.edition !== edition) return;
     engine.makeNodes();
     give("nodes");
   },
   async draw(job) {
     if (latest <= job.id && engine) await draw(job);
     else self.postMessage({ type: "dropped", id: job.id });
+  },
+  async crop(job) {
+    box = job.box;
+    if (engine) engine.crop(box);
   },
   async pick({ id, view, x, y }) {
     self.postMessage({ type: "picked", id, distance: engine ? engine.pick(view, x, y) : 0 });

@@ -1,5 +1,6 @@
 """``nerfvol convert``: files that open, the cost in a sentence, and refusals."""
 
+import gzip
 import json
 
 import pytest
@@ -43,6 +44,23 @@ def test_there_and_back_with_and_without_images(tmp_path, tiny_scene, command, o
         "convert", splats, "--to", "octree", "--level", 5, "--data", tiny_scene, "--time-budget", "0.3s", "--out", again
     )
     assert code == 0 and "steps on the photographs" in out, err
+
+
+def test_convert_and_export_make_the_same_splats(tmp_path, command, octree_file):
+    for name in ("s.ply", "s.spz"):
+        if name.endswith("spz"):
+            pytest.importorskip("gsply", reason="needs gsply")
+        converted, exported = tmp_path / f"c_{name}", tmp_path / f"e_{name}"
+        assert command("convert", octree_file, "--to", "splats", "--out", converted)[0] == 0
+        assert command("export", octree_file, "--out", exported, "--format", "splats" if name == "s.ply" else "spz")[0] == 0
+        unpack = gzip.decompress if name.endswith("spz") else bytes  # whose head has the time
+        assert unpack(converted.read_bytes()) == unpack(exported.read_bytes())
+    n = load_model(tmp_path / "c_s.ply").describe()["splats"]
+    few = tmp_path / "few.ply"
+    assert command("convert", octree_file, "--to", "splats", "--max-splats", n - 1, "--out", few)[0] == 0
+    assert n / 16 < load_model(few).describe()["splats"] < n
+    code, _, err = command("convert", octree_file, "--to", "splats", "--max-splats", 1, "--out", few)
+    assert code == 2 and "at most 1 splats were asked for: this octree has" in err and err.count("\n") == 1, err
 
 
 @pytest.mark.parametrize("arguments, reason", [

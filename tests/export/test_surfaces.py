@@ -127,7 +127,7 @@ def test_given_cameras_see_what_they_see(tmp_path, sphere):
 
 def test_splats_have_surfaces_too(tmp_path, sphere):
     pytest.importorskip("skimage")
-    from nerfvol.export.leaves import splats_of_leaves
+    from nerfvol.starts.gaussians import splats_of_leaves
 
     export_model(SplatModel(splats_of_leaves(sphere.octree)), tmp_path / "a.ply", "mesh", resolution=24, views=16)
     vertices = load_model(tmp_path / "a.ply").cloud.positions

@@ -1,4 +1,4 @@
-"""Converting there and back: a sphere of discs becomes an octree of the same radius, whose surfels show it again."""
+"""Converting there and back: a sphere of discs becomes an octree of the same radius, whose leaves show it again."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,9 @@ from nerfvol.region import SceneBounds
 from nerfvol.rotations import turning_z_to
 from nerfvol.splats.points import dc_of_colour
 from nerfvol.splats.splats import Splats
+from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.training import convert
-from nerfvol.training.convert import cameras_around, octree_of, seen_by, splats_of
+from nerfvol.training.convert import cameras_around, discs_of, octree_of, seen_by
 from nerfvol.views import OctreeModel, SplatModel
 from tests.fixtures.tiny import TINY_RADIUS, sphere_colour
 
@@ -85,12 +86,14 @@ def test_the_same_octree_for_any_number_of_threads(converted):
     np.testing.assert_array_equal(a.leaf_ijk, b.leaf_ijk)
 
 
-def test_and_back(converted):
-    """Surfels of the octree show the sphere again, on its place."""
+@pytest.mark.parametrize("way", ["as leaves", "as discs"])
+def test_and_back(converted, way):
+    """Splats of the octree show the sphere again, on its place."""
     _, seen, (octree, _) = converted
-    model = SplatModel(splats_of(octree, seen, WHITE))
-    radius = np.linalg.norm(model.splats.means + model.splats.origin, axis=1)
-    assert np.abs(radius - TINY_RADIUS).max() < 3 * SIDE
+    model = SplatModel(splats_of_leaves(octree) if way == "as leaves" else discs_of(octree, seen, WHITE))
+    opaque = model.splats.select(np.flatnonzero(model.splats.logits > 0))
+    radius = np.linalg.norm(opaque.means + opaque.origin, axis=1)
+    assert opaque.n > 500 and np.abs(radius - TINY_RADIUS).max() < 3 * SIDE
     camera = cameras(3, 5)[1]
     assert psnr(model.render(camera, WHITE)["rgb"], OctreeModel(octree).render(camera, WHITE)["rgb"]) > 23
 

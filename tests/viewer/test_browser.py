@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.paths import load_cameras
+from nerfvol.export import export_model
 from nerfvol.export.page import first_camera, write
 from nerfvol.files.page import OPENING
 from nerfvol.models import load_model
@@ -266,6 +267,36 @@ def test_it_fits_a_narrow_screen(browser, files):
     page.close()
 
 
+OVERLAID = """([x, y]) => {
+  const overlay = document.getElementById("overlay"), k = overlay.width / overlay.clientWidth;
+  return !overlay.hidden && overlay.getContext("2d").getImageData(x * k - 4, y * k - 4, 8, 8).data.some((byte) => byte > 0);
+}"""
+
+
+@pytest.mark.parametrize("name", ["octree", "splats"])
+def test_a_crop_box_shows_what_export_writes(browser, files, tmp_path, name):
+    page = opened(browser, files / f"{name}.html")
+    whole = picture(page, 203, 134)
+    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    page.click("#menu")
+    page.evaluate("(e => { e.value = 0.1; e.oninput(); })(document.getElementById('x0'))")
+    words = page.inner_text("#box")
+    assert words.startswith("nerfvol export FILE --crop 0.1,")
+    page.wait_for_timeout(100)  # the box follows the slider at a distance
+    cropped = picture(page, 203, 134)
+    crop = [float(x) for x in words.split()[-1].split(",")]
+    export_model(load_model(files / f"{name}.html"), tmp_path / "part.html", crop=crop)
+    model = load_model(tmp_path / "part.html")
+    native = model.render(first_camera(load_model(files / f"{name}.html").metadata["orbit"], 203, 134))["rgb"]
+    error = ((cropped - np.clip(native, 0, 1)) ** 2).mean()
+    # leaves at the cut: a file forgets what they had in common with those that are gone; splats are the same
+    assert error < (1e-5 if name == "splats" else 1e-4) < 0.1 * ((whole - cropped) ** 2).mean()
+    page.click("#uncrop")
+    page.wait_for_timeout(100)
+    assert np.array_equal(picture(page, 203, 134), whole)
+    page.close()
+
+
 def test_a_served_page_jumps_to_photographs_and_follows_a_new_model(browser):
     from nerfvol.viewer.server import ViewServer
     from nerfvol.viewer.shown import Shown
@@ -289,6 +320,19 @@ def test_a_served_page_jumps_to_photographs_and_follows_a_new_model(browser):
         assert np.allclose(camera(page)["position"], camera_there.position, atol=1e-9)
         assert np.allclose(axes(camera(page)), camera_there.c2w[:3, :3].T, atol=1e-9)
         assert page.inner_text("#score").startswith("b: PSNR ")
+        # a click on another camera's place in the picture chooses it
+        width, height = page.evaluate("[canvas.clientWidth, canvas.clientHeight]")
+        page.evaluate("(nerfvol.camera = {...nerfvol.first, fov: 2.5}, 0)")
+        tip = page.evaluate(
+            "([at, w, h]) => project(nerfvol.camera, at, w, h)", [shown.dataset.cameras[2].position.tolist(), width, height]
+        )
+        assert 0 < tip[0] < width and 0 < tip[1] < height
+        assert page.evaluate(OVERLAID, tip)
+        page.evaluate("(document.getElementById('panel').hidden = true, 0)")
+        page.mouse.click(*tip)
+        wait(page, "document.getElementById('photos').value === '2'")
+        assert np.allclose(camera(page)["position"], shown.dataset.cameras[2].position, atol=1e-9)
+        page.evaluate("(document.getElementById('panel').hidden = false, 0)")
         before = camera(page)
         shown.publish(cloud_of_splats(1), "step 7")  # of another kind even
         wait(page, "document.getElementById('live').textContent === 'step 7' && nerfvol.drawing.isSplats")

@@ -1,5 +1,6 @@
 """A training run that is looked at: its bits are those of one that is not, and there are editions of it."""
 
+import threading
 import time
 
 import pytest
@@ -34,6 +35,30 @@ def test_editions_come_out_and_change_nothing(tiny_scene, tmp_path, representati
     train.train(plain, say=lambda sentence: None)
     name = f"{representation}.safetensors"
     assert (tmp_path / "seen" / name).read_bytes() == (tmp_path / "unseen" / name).read_bytes()
+
+
+def test_pausing_is_no_training_time(tiny_scene, tmp_path):
+    """The pause is as long as the whole budget of the training, which ends by its clock all the same steps later."""
+    shown, pause, stood = Shown("paused"), 1.5, []
+
+    class Pausing(Live):
+        def __call__(self, run, phase, began_stage):
+            if phase.steps_done == 5:
+                shown.training = True
+                shown.pause(True)
+                threading.Timer(pause, shown.pause, (False,)).start()
+                before = run.clock.elapsed(), time.perf_counter()
+                super().__call__(run, phase, began_stage)
+                stood.append((run.clock.elapsed() - before[0], time.perf_counter() - before[1]))
+            else:
+                super().__call__(run, phase, began_stage)
+
+    live = Pausing(shown, every=1e9)
+    train.train(runs.settings(tiny_scene, tmp_path / "run"), watch=live, say=lambda sentence: None)
+    (counted, passed), = stood
+    assert passed >= pause and passed - counted >= pause - 0.05  # a step's edition counts, standing still does not
+    shown.pause(True)
+    shown.wait_while_paused(lambda: True)  # Ctrl-C ends a pause
 
 
 def test_an_edition_that_is_due_waits_for_the_one_before(monkeypatch):

@@ -156,8 +156,18 @@ def test_who_waits_hears_of_a_new_model(server, shown, monkeypatch):
     shown.publish(ball(0, 3), "coarser")
     assert reader.getresponse().read() in (old, shown.edition.data)
     waiting.join(30)
-    assert heard == [{"version": version + 1, "sentence": "coarser"}]
+    assert heard == [{"version": version + 1, "sentence": "coarser", "training": False, "paused": False}]
     reader.close()
+
+
+def test_a_training_is_paused_by_who_has_the_token(server, shown):
+    assert json.loads(ask(server, "/pause?on=1", "POST")[1])["paused"] is False  # there is none
+    shown.training = True
+    assert ask(server, "/pause?on=1", "POST", token=False)[0].status == 403 and not shown.paused
+    assert ask(server, "/pause?on=yes", "POST")[0].status == 400 and not shown.paused
+    assert json.loads(ask(server, "/pause?on=1", "POST")[1])["paused"] is True
+    assert json.loads(ask(server, "/pause?on=0", "POST")[1])["paused"] is False
+    shown.training = False
 
 
 def test_a_reader_that_goes_disturbs_nobody(server, capsys):

@@ -6,7 +6,7 @@ import pytest
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.errors import InputError
 from nerfvol.export import export_model
-from nerfvol.export.leaves import splats_of_leaves
+from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.octree.points import leaf_density
 from nerfvol.rotations import rotations
 from nerfvol.splats.turn import turned
