@@ -7,7 +7,7 @@
 docs/data_synth.md has a snippet for each of the names below.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 from data_synth import (
     clouds,
@@ -22,13 +22,14 @@ from data_synth import (
     volumes,
 )  # fmt: skip
 from data_synth.cameras import Camera, Viewpoints, look_at
-from data_synth.dataset import Options, render_view, write_dataset
+from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture, read_exr, write_exr, write_png
 from data_synth.integrators import DeepShadow, Emission, March, Path, Preview
 from data_synth.scene import Scene
 from data_synth.scene_file import load as load_scene
 from data_synth.transmittance import sample_flights, sample_transmittance
+from data_synth.views import render_view
 
 render = render_view
 
