@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test core wheels lint sanitize clang no-compiler clients wasm mutants fuzz clean
+.PHONY: demo test core wheels lint sanitize clang no-compiler recipes clients wasm mutants fuzz clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -47,6 +47,11 @@ clang: $(BIN)/python
 no-compiler: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python tools/no_compiler.py
+
+# docs/cluster.md followed on this machine: farms, local processes, SSH, Slurm, TLS; root installs what that takes.
+recipes: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]'
+	$(BIN)/python tools/cluster_recipes.py
 
 # The kernels of web pages; what it makes is committed (tools/web_kernels.py says what it takes).
 wasm:

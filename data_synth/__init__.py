@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from data_synth import (
@@ -29,14 +29,15 @@ if TYPE_CHECKING:
         volumes,
     )  # fmt: skip
     from data_synth.cameras import Camera, Viewpoints, look_at
-    from data_synth.dataset import Options, render_view, write_dataset
-    from data_synth.dataset import render_view as render
+    from data_synth.dataset import Options, write_dataset
     from data_synth.errors import InputError, RenderWarning
     from data_synth.image import Picture, read_exr, write_exr, write_png
     from data_synth.integrators import DeepShadow, Emission, March, Path, Preview
     from data_synth.scene import Scene
     from data_synth.scene_file import load as load_scene
     from data_synth.transmittance import sample_flights, sample_transmittance
+    from data_synth.views import render_view
+    from data_synth.views import render_view as render
 
 __all__ = [
     "Camera", "DeepShadow", "Emission", "InputError", "March", "Options", "Path", "Picture", "Preview", "RenderWarning",
@@ -46,8 +47,8 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "Camera": "cameras", "Viewpoints": "cameras", "look_at": "cameras", "Options": "dataset", "render_view": "dataset",
-    "render": "dataset:render_view", "write_dataset": "dataset", "InputError": "errors", "RenderWarning": "errors",
+    "Camera": "cameras", "Viewpoints": "cameras", "look_at": "cameras", "Options": "dataset", "render_view": "views",
+    "render": "views:render_view", "write_dataset": "dataset", "InputError": "errors", "RenderWarning": "errors",
     "Picture": "image", "read_exr": "image", "write_exr": "image", "write_png": "image", "DeepShadow": "integrators",
     "Emission": "integrators", "March": "integrators", "Path": "integrators", "Preview": "integrators", "Scene": "scene",
     "load_scene": "scene_file:load", "sample_flights": "transmittance", "sample_transmittance": "transmittance",

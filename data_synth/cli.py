@@ -12,17 +12,29 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
 from data_synth import integrators, scene_file, scenes
-from data_synth.dataset import Each, Files, Options, Renderable, View, render_files, render_view, write_dataset
+from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError, RenderWarning
-from data_synth.image import encode_png, write_png
+from data_synth.image import Picture, encode_png, write_png
 from data_synth.integrators import Integrator
 from data_synth.jit import say_when_compiling
 from data_synth.scene import Scene
+from data_synth.views import (
+    Each,
+    Files,
+    Piece,
+    Renderable,
+    View,
+    pieces_of,
+    render_numbered,
+    render_piece,
+    render_view,
+    rendered,
+)
 
 OWN = {key: "--" + key.replace("_", "-") for key in ("spp", "max_depth", "beams", "side", "resolution", "fill")}
 
@@ -210,7 +222,7 @@ def _render(args: argparse.Namespace, each: Each | None) -> int:
     scene = _scene(args)
     integrator = _integrator(args, scene)
     if args.picture:
-        return _portrait(scene, integrator, options.size, args)
+        return _portrait(scene, integrator, options.size, args, each)
 
     def progress(done: int, total: int) -> None:
         if sys.stderr.isatty():
@@ -222,10 +234,10 @@ def _render(args: argparse.Namespace, each: Each | None) -> int:
     return 0
 
 
-def render_task(settings: Mapping[str, Any], files: Mapping[str, Path], view: View) -> Files:
-    """The files of one view of the scene that settings["argv"] describes: for the workers of a cluster."""
+def render_task(settings: Mapping[str, Any], files: Mapping[str, Path], piece: Piece) -> Files | np.ndarray:
+    """A piece of the scene that settings["argv"] describes: for the workers of a cluster."""
     args, scene, integrator = _opened(tuple(settings["argv"]))
-    return render_files(scene, integrator, args.seed, args.exr, view)
+    return render_piece(scene, integrator, args.seed, args.exr, piece)
 
 
 @functools.lru_cache(maxsize=1)
@@ -247,11 +259,18 @@ def probe(what: str) -> bytes:
     return picture.rgb.tobytes() + encode_png(picture.rgba8(1.0))
 
 
-def _portrait(scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace) -> int:
+def _portrait(
+    scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace, each: Each | None
+) -> int:
     """One view from the middle of the scene's viewing band, over a pale backdrop that darkens downwards."""
     started = time.perf_counter()
     camera = scene.viewpoints.camera(-55.0, 0.5 * sum(scene.viewpoints.elevation) - 5.0, *size)
-    rgba = render_view(scene, camera, integrator, args.seed).rgba8(scene.exposure) / 255.0
+    view = View(0, "", camera)
+    if each is None or len(pieces_of(integrator, [view])) == 1:  # too small to share
+        picture = render_numbered(scene, integrator, args.seed, view)
+    else:
+        picture = cast(Picture, next(rendered(each, integrator, [view])))
+    rgba = picture.rgba8(scene.exposure) / 255.0
     backdrop = np.linspace(0.93, 0.76, size[1])[:, None, None] * np.array([0.96, 0.985, 1.0])
     pixels = rgba[..., :3] * rgba[..., 3:] + backdrop * (1.0 - rgba[..., 3:])
     write_png(args.picture, np.rint(255.0 * pixels).astype(np.uint8))

@@ -2,40 +2,25 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 import json
 import os
 import platform
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from data_synth.cameras import Camera, Viewpoints
+from data_synth.cameras import Camera
 from data_synth.errors import InputError
-from data_synth.image import Picture, encode_exr, encode_png, replacing
+from data_synth.image import Picture, replacing
 from data_synth.integrators import Integrator
-from data_synth.scene import Scene
+from data_synth.views import Each, Files, Renderable, View, encode, render_numbered, rendered
 
-Files = dict[str, bytes]
-"""The files of a view by the end of their names."""
-
-
-class View(NamedTuple):
-    """One picture of a data set: its number through the splits, its name below the folder, its camera."""
-
-    number: int
-    name: str
-    camera: Camera
-
-
-Each = Callable[[Callable[[View], Files], Sequence[View]], Iterable[Files]]
 PLAN, PROVENANCE = "plan.json", "provenance.json"
 """What a set is of: while it is not complete, and then."""
 SPLITS = ("train", "val", "test")
@@ -51,7 +36,7 @@ class Options:
     progress: called with (views done, views in all) after every view.
     chosen: of all views, counted through the splits, (first, last, step): these alone are rendered, and of these only those
     that are not there yet; the folder is complete, and says so, once all are, whoever made them. None: all.
-    each: how views are rendered: (function, views) -> their files in order; None: here, one after the other.
+    each: renders views, large ones in parts, elsewhere; None: here, one after the other.
     """
 
     views: int = 60
@@ -70,30 +55,6 @@ class Options:
             raise InputError(f"--seed: expected a whole number from 0 on, got {self.seed}")
         if min(self.size) < 1 or max(self.size) > 16384:
             raise InputError(f"--size: expected 1 to 16384 pixels a side, got {self.size[0]}x{self.size[1]}")
-
-
-class Renderable(Protocol):
-    """What a folder of pictures is made of: a ``Scene``, or anything else that renders itself."""
-
-    name: str
-    viewpoints: Viewpoints
-    aabb: np.ndarray
-    integrators: tuple[str, ...]
-    exposure: float
-    parameters: dict
-
-    def render(self, camera: Camera, *, seed: int = 0) -> Picture: ...
-
-    def write_truth(self, out_dir: Path) -> None: ...
-
-
-def render_view(scene: Renderable, camera: Camera, integrator: Integrator | None = None, seed: int = 0) -> Picture:
-    """One view of any scene: by ``integrator`` if given, else the way the scene prefers."""
-    if integrator is None:
-        return scene.render(camera, seed=seed)
-    if not isinstance(scene, Scene):
-        raise InputError(f"--integrator: the {scene.name} renders itself, got {integrator}")
-    return integrator.render(scene, camera, seed=seed)
 
 
 def split_cameras(scene: Renderable, views: int, size: tuple[int, int], seed: int) -> dict[str, list[Camera]]:
@@ -131,17 +92,16 @@ def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Option
     for split in splits:
         (out_dir / split).mkdir(exist_ok=True)
     wanted = [view for view in wanted if not _is_there(out_dir, view, options.exr)]
-    render = functools.partial(render_files, scene, options.integrator, options.seed, options.exr)
     with ThreadPoolExecutor(1) as writer:  # compresses and writes a picture while the next one renders
+
+        def encoded(picture: Picture) -> Future[Files]:
+            return writer.submit(encode, picture, scene.exposure, options.exr)
+
         if options.each is None:
-            made = (
-                writer.submit(
-                    encode, render_numbered(scene, options.integrator, options.seed, view), scene.exposure, options.exr
-                )
-                for view in wanted
-            )
+            made = (encoded(render_numbered(scene, options.integrator, options.seed, view)) for view in wanted)
         else:
-            made = map(_done, options.each(render, wanted))
+            elsewhere = rendered(options.each, options.integrator, wanted)
+            made = (encoded(found) if isinstance(found, Picture) else _done(found) for found in elsewhere)
         written = []
         for done, (view, files) in enumerate(zip(wanted, made, strict=True), 1):
             written.append(writer.submit(_write_files, out_dir / view.name, files))
@@ -163,22 +123,6 @@ def views_of(splits: Mapping[str, Sequence[Camera]]) -> list[View]:
     """All views of a data set, in the order of its splits."""
     rows = [(f"{split}/r_{k}", camera) for split, cameras in splits.items() for k, camera in enumerate(cameras)]
     return [View(number, name, camera) for number, (name, camera) in enumerate(rows)]
-
-
-def render_numbered(scene: Renderable, integrator: Integrator | None, seed: int, view: View) -> Picture:
-    """One view; its seed is that of the data set and its number, whoever renders it."""
-    return render_view(scene, view.camera, integrator, (seed * 1_000_003 + view.number) & 0x7FFFFFFF)
-
-
-def encode(picture: Picture, exposure: float, exr: bool) -> Files:
-    """The files of a picture."""
-    files = {".png": encode_png(picture.rgba8(exposure))}
-    return files | ({".exr": encode_exr(exr_channels(picture))} if exr else {})
-
-
-def render_files(scene: Renderable, integrator: Integrator | None, seed: int, exr: bool, view: View) -> Files:
-    """The files of one view."""
-    return encode(render_numbered(scene, integrator, seed, view), scene.exposure, exr)
 
 
 def _done(files: Files) -> Future[Files]:
@@ -229,15 +173,6 @@ def _complete(out_dir: Path) -> dict | None:
     except (OSError, ValueError):
         return None
     return {key: value for key, value in found.items() if key != "seconds"} if isinstance(found, dict) else None
-
-
-def exr_channels(picture: Picture) -> dict[str, np.ndarray]:
-    """Channels of a float picture: R, G, B (linear, premultiplied), A, Z (distance), variance of the mean."""
-    channels = {name: picture.rgb[..., c] for c, name in enumerate("RGB")}
-    channels |= {"A": picture.alpha, "Z": picture.distance}
-    if picture.variance is not None:
-        channels |= {f"variance.{name}": picture.variance[..., c] for c, name in enumerate("RGB")}
-    return channels
 
 
 def _transforms(scene: Renderable, split: str, cameras: list[Camera]) -> dict:

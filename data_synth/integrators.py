@@ -1,5 +1,7 @@
 """The integrators, small objects with ``render(scene, camera, seed) -> Picture``.
 
+``sums(scene, camera, seed, part)`` renders a part of a picture, and ``picture`` makes a Picture of the sums of all parts.
+
 | name     | solves                                            | class      |
 |----------|---------------------------------------------------|------------|
 | emission | emission and absorption, no scattering            | Emission   |
@@ -17,12 +19,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from data_synth import gather, march, path, shadowmap
+from data_synth import gather, march, parts, path, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.gather import Gathered
 from data_synth.image import Picture
 from data_synth.jit import in_bands
+from data_synth.parts import Part
 from data_synth.rng import new_rng
 from data_synth.shadowmap import ShadowMaps
 from data_synth.world import World, has_surfaces
@@ -38,6 +41,18 @@ class Integrator(Protocol):
     """What the table's classes have in common."""
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture: ...
+
+    def parts(self, height: int, width: int) -> list[Part]:
+        """Into what a picture may be cut; a single one where it should stay whole."""
+        ...
+
+    def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
+        """(rows, width, channels) float64."""
+        ...
+
+    def picture(self, sums: np.ndarray) -> Picture:
+        """What (height, width, channels) of ``sums`` make."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -57,11 +72,19 @@ class March:
         return shadowmap.none(), None
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
+        return self.picture(self.sums(scene, camera, seed, parts.whole(camera.height)))
+
+    def parts(self, height: int, width: int) -> list[Part]:
+        """See Integrator; bands of rows."""
+        return parts.cut(height, width, self.side**2)
+
+    def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
+        """See Integrator; rgb, alpha, distance."""
         world, maps, gathered = _prepared(self, scene)
         eye, mode, rho_J = camera.c2w[:3, 3], self.mode, np.empty(0, np.float32)
         if gathered is not None:
             if not gather.outside(world.medium, eye):
-                return replace(self, resolution=MAP_RESOLUTION).render(scene, camera, seed)
+                return replace(self, resolution=MAP_RESOLUTION).sums(scene, camera, seed, part)
             mode, rho_J = march.GATHERED, gather.towards(world, gathered, eye)
         lighting = march.Lighting(mode, maps, rho_J)
         out, data = np.empty((camera.height, camera.width, 5)), camera.data()
@@ -72,8 +95,11 @@ class March:
             else:
                 march.render_rows(world, lighting, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last)
 
-        in_bands(rows, camera.height, 4)
-        return Picture(out[..., :3], out[..., 3], out[..., 4], samples=self.side**2)
+        return _banded(rows, out, part, 4)
+
+    def picture(self, sums: np.ndarray) -> Picture:
+        """See Integrator."""
+        return Picture(sums[..., :3], sums[..., 3], sums[..., 4], samples=self.side**2)
 
 
 @dataclass(frozen=True)
@@ -110,6 +136,10 @@ class DeepShadow(March):
         if self.resolution is not None and not 2 <= self.resolution <= 1024:
             raise InputError(f"--resolution: expected a whole number from 2 to 1024, got {self.resolution}")
 
+    def parts(self, height: int, width: int) -> list[Part]:
+        """See Integrator; whole pictures, for each of which light is gathered."""
+        return [parts.whole(height)]
+
     def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
         together = self.resolution is None and self.fill == "sweep" and gather.possible(world)
         if together and not has_surfaces(world):
@@ -137,16 +167,36 @@ class Path:
             raise InputError(f"--max-depth: expected 0 or more, got {self.max_depth}")
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
+        return self.picture(self.sums(scene, camera, seed, parts.whole(camera.height, self.spp)))
+
+    def parts(self, height: int, width: int) -> list[Part]:
+        """See Integrator; bands of rows, and blocks of samples."""
+        return parts.cut(height, width, self.spp, splits=True)
+
+    def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
+        """See Integrator; over the samples, of rgb, alpha, distance and the squares of rgb."""
         world = _prepared(self, scene).world
         out, data = np.empty((camera.height, camera.width, 8)), camera.data()
         depth = UNLIMITED if self.max_depth is None else self.max_depth
-        settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed)
+        settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed, part.first, part.last)
 
         def rows(first: int, last: int) -> None:
-            path.render_rows(world, data, settings, new_rng(0, 0), out, first, last)
+            path.render_rows(world, data, settings, new_rng(0, 0), np.empty((64, 8)), out, first, last)
 
-        in_bands(rows, camera.height, 2)
-        return Picture(out[..., :3], out[..., 3], out[..., 4], out[..., 5:8], self.spp)
+        return _banded(rows, out, part, 2)
+
+    def picture(self, sums: np.ndarray) -> Picture:
+        """See Integrator; with the variance of the mean."""
+        n = self.spp
+        mean = sums / n
+        variance = np.maximum(sums[..., 5:] - n * mean[..., :3] ** 2, 0.0) / (float(n) * max(n - 1, 1))
+        return Picture(mean[..., :3], mean[..., 3], mean[..., 4], variance, n)
+
+
+def _banded(rows: Callable[[int, int], None], out: np.ndarray, part: Part, band: int) -> np.ndarray:
+    """The part's rows of ``out`` once ``rows`` has filled them, on all cores; of others not even memory is used."""
+    in_bands(lambda first, last: rows(part.top + first, part.top + last), part.bottom - part.top, band)
+    return out if part.bottom - part.top == len(out) else out[part.top : part.bottom].copy()
 
 
 INTEGRATORS: dict[str, Callable[..., Integrator]] = {

@@ -94,8 +94,19 @@ def say_when_compiling(stream: TextIO | None = None) -> Iterator[None]:
         print(f"... ready after {spoken[1] - spoken[0]:.0f} s; the next run finds it done", file=out, flush=True)
 
 
+_threads = 0
+
+
+def use_threads(n: int) -> None:
+    """Kernels use ``n`` threads from now on; 0: one a core. What they compute is the same."""
+    global _threads
+    _threads = n
+
+
 def core_count() -> int:
-    """Cores this process may use."""
+    """Cores this process may use, or as many as :func:`use_threads` said."""
+    if _threads:
+        return _threads
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

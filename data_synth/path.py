@@ -20,6 +20,7 @@ from data_synth.jit import jit, kernel
 from data_synth.lights import POINT, column3, escaped, quad_pdf, quad_radiance, sample_light
 from data_synth.materials import DIELECTRIC
 from data_synth.media import attribute, box_interval, extinction, lookup
+from data_synth.parts import BLOCK
 from data_synth.rng import reseed, uniform
 from data_synth.traverse import collisions, traversal
 from data_synth.vec import add, along, dot, largest, mean, mul, neg, scale, sub
@@ -34,13 +35,16 @@ UNKNOWN = -1.0
 
 
 class Settings(NamedTuple):
-    """spp paths per pixel of at most max_depth scatterings; jitter: anywhere in the pixel; seed of the picture."""
+    """spp paths per pixel of at most max_depth scatterings, of which this part has blocks first ... last - 1 (parts.py);
+    jitter: anywhere in the pixel; seed of the picture."""
 
     spp: int
     max_depth: int
     jitter: bool
     opaque_sky: bool
     seed: int
+    first: int
+    last: int
 
 
 class Flight(NamedTuple):
@@ -245,23 +249,40 @@ def trace_path(w, ray, inside, settings, rng):
     return L, alpha, far
 
 
+@jit
+def add_top_two(stack, waiting):
+    """Row waiting - 2 of ``stack`` becomes its sum with the row after it, which goes."""
+    for c in range(stack.shape[1]):
+        stack[waiting - 2, c] += stack[waiting - 1, c]
+    return waiting - 1
+
+
 @kernel
-def render_rows(w, camera, settings, rng, out, first, last):
-    """Rows first..last - 1 of out (H, W, 8) = rgb, alpha, distance, variance of the mean rgb."""
+def render_rows(w, camera, settings, rng, stack, out, first, last):
+    """Rows first..last - 1 of out (H, W, 8) = sums over this part's samples of rgb, alpha, distance and squares of rgb.
+
+    stack (64, 8): where nodes of the tree of blocks (parts.py) wait for their right halves.
+    """
     o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
-    n, inside = settings.spp, inside_at(w, o)
+    inside, width, pixels = inside_at(w, o), out.shape[1], out.shape[0] * out.shape[1]
     for j in range(first, last):
-        for i in range(out.shape[1]):
-            reseed(rng, settings.seed, j * out.shape[1] + i)
-            r, g, b, rr, gg, bb, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for _ in range(n):
-                x, y = (uniform(rng), uniform(rng)) if settings.jitter else (0.5, 0.5)
-                L, a, t = trace_path(w, (o, pixel_ray(camera, i + x, j + y)), inside, settings, rng)
-                r, g, b, alpha, far = r + L[0], g + L[1], b + L[2], alpha + a, far + t
-                rr, gg, bb = rr + L[0] * L[0], gg + L[1] * L[1], bb + L[2] * L[2]
-            r, g, b = r / n, g / n, b / n
-            out[j, i, 0], out[j, i, 1], out[j, i, 2], out[j, i, 3], out[j, i, 4] = r, g, b, alpha / n, far / n
-            d = float(n) * max(n - 1, 1)
-            out[j, i, 5] = max(rr - n * r * r, 0.0) / d
-            out[j, i, 6] = max(gg - n * g * g, 0.0) / d
-            out[j, i, 7] = max(bb - n * b * b, 0.0) / d
+        for i in range(width):
+            waiting = 0
+            for block in range(settings.first, settings.last):
+                reseed(rng, settings.seed, block * pixels + j * width + i)
+                r, g, b, rr, gg, bb, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for _ in range(min(BLOCK, settings.spp - block * BLOCK)):
+                    x, y = (uniform(rng), uniform(rng)) if settings.jitter else (0.5, 0.5)
+                    L, a, t = trace_path(w, (o, pixel_ray(camera, i + x, j + y)), inside, settings, rng)
+                    r, g, b, alpha, far = r + L[0], g + L[1], b + L[2], alpha + a, far + t
+                    rr, gg, bb = rr + L[0] * L[0], gg + L[1] * L[1], bb + L[2] * L[2]
+                stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3] = r, g, b, alpha
+                stack[waiting, 4], stack[waiting, 5], stack[waiting, 6], stack[waiting, 7] = far, rr, gg, bb
+                waiting += 1
+                done = block + 1 - settings.first
+                while done % 2 == 0:
+                    waiting, done = add_top_two(stack, waiting), done // 2
+            while waiting > 1:
+                waiting = add_top_two(stack, waiting)
+            for c in range(8):
+                out[j, i, c] = stack[0, c]

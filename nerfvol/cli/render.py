@@ -107,6 +107,10 @@ def run(options: RenderOptions) -> int:
         )
     if ending == ".png" and len(cameras) != 1:
         raise InputError(f"{out} is one picture and there are {len(cameras)} views: give --out a folder or a video")
+    if ending == ".png" and options.cluster is not None:
+        raise InputError(
+            f"--cluster shares out views, and {out} is one picture: leave --cluster out, or give --out a folder"
+        )
     prepare_outputs(folder=str(out.parent if ending else out))
     film = Film(
         target.model,

@@ -44,12 +44,13 @@ def _without_cluster(arguments: Sequence[str]) -> tuple[list[str], str | None]:
     return argv, where
 
 
-def _on_cluster(
-    where: str, argv: list[str], stack: contextlib.ExitStack
-) -> Callable[[Callable[..., Any], Sequence[Any]], Iterable[Any]]:
-    """Renders views on the workers, in the form that data_synth asks for; connects when the first views are asked for."""
+def _on_cluster(where: str, argv: list[str], stack: contextlib.ExitStack) -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """Renders views and parts of views on the workers, in the form that data_synth asks for; connects when the first are
+    asked for."""
 
-    def each(render: Callable[..., Any], views: Sequence[Any]) -> Iterable[Any]:
+    def each(pieces: Sequence[Any]) -> Iterable[Any]:
+        if not pieces:
+            return []
         from nerfvol.cluster.engine import connect
         from nerfvol.cluster.fit import Needs, with_data
         from nerfvol.cluster.tasks import Job
@@ -61,7 +62,7 @@ def _on_cluster(
         ]  # volumes and scene files, which the workers must have too
         here = {word: str(Path(word).resolve()) for word in files}
         resolved = [word if (w := word.rpartition("=")[2]) not in here else word.replace(w, here[w]) for word in argv]
-        job = Job("data_synth.cli:render_task", {"argv": resolved})
+        job = Job("data_synth.cli:render_task", {"argv": resolved}, threads="data_synth.jit:use_threads")
         client = stack.enter_context(connect(where))
         integrator = next((argv[k + 1] for k, word in enumerate(argv[:-1]) if word == "--integrator"), "")
         probe = f"data_synth.cli:probe?{argv[0]}:{integrator}"
@@ -69,7 +70,7 @@ def _on_cluster(
         window = Window(client, job, Needs((probe,), with_data(list(here.values())), patience=600.0))
         for message in window.messages:
             print(message, file=sys.stderr)
-        return window.results(list(views))
+        return window.results(list(pieces))
 
     return each
 

@@ -53,6 +53,15 @@ def fingerprint(needs: Needs) -> str:
     return digest.hexdigest()[:16]
 
 
+def description() -> str:
+    """What draws here, for a person."""
+    import PIL
+
+    from nerfvol.kernels import ops
+
+    return f"nerfvol {__version__} with {ops.isa()} kernels and Pillow {PIL.__version__}"
+
+
 def listing(folder: str | Path) -> str:
     """A hash of the names and sizes of the files in ``folder``, at any depth, or of a file; "" where there is no such thing."""
     root = Path(folder)
@@ -75,7 +84,7 @@ class Fit(WorkerPlugin):
     """Gives present and later workers the resource ``resource`` where they are fit, else says why they are not."""
 
     def __init__(self, needs: Needs, expected: str) -> None:
-        self.needs, self.expected = needs, expected
+        self.needs, self.expected, self.client = needs, expected, description()
         asked = hashlib.sha256(repr(needs).encode()).hexdigest()
         self.name = self.resource = f"nerfvol-{expected}-{asked[:6]}"
 
@@ -92,11 +101,8 @@ class Fit(WorkerPlugin):
 
     def reason(self) -> str:
         """Why this machine must not work, or nothing."""
-        from nerfvol.kernels import ops
-
-        found = fingerprint(self.needs)
-        if found != self.expected:
-            return f"nerfvol {__version__} with {ops.isa()} kernels draws other pictures ({found}, not {self.expected})"
+        if fingerprint(self.needs) != self.expected:
+            return f"{description()} draws other pictures than the client's {self.client}"
         for folder, contents in self.needs.data:
             here = listing(folder)
             if here != contents:
@@ -117,6 +123,7 @@ def welcome(client: Client, needs: Needs) -> tuple[str, list[str]]:
     plugin = Fit(needs, fingerprint(needs))
     patience = needs.patience
     deadline = time.monotonic() + patience
+    strangers: dict[str, str] = {}
     while True:
         try:
             client.register_plugin(plugin)
@@ -124,10 +131,13 @@ def welcome(client: Client, needs: Needs) -> tuple[str, list[str]]:
         except OSError as error:  # a worker died before it answered, or is frozen and was given up
             if time.monotonic() > deadline:
                 raise InputError(f"--cluster: its workers do not answer ({error})") from error
+        except Exception:  # one of them knows no such plugin; the others have it
+            strangers = _strangers(client)
+            break
     while True:
         workers = client.scheduler_info(n_workers=-1)["workers"]
         fit = [address for address, worker in workers.items() if worker["resources"].get(plugin.resource)]
-        refused = _refused(client, plugin.resource, workers)
+        refused = strangers | _refused(client, plugin.resource, workers)
         if fit and len(fit) + len(refused) >= len(workers):
             return plugin.resource, [f"{address} does not work on this: {why}" for address, why in refused.items()]
         if time.monotonic() > deadline:
@@ -136,6 +146,16 @@ def welcome(client: Client, needs: Needs) -> tuple[str, list[str]]:
             reasons = "; ".join(f"{address}: {why}" for address, why in refused.items()) or "there is no worker"
             raise InputError(f"--cluster: no worker is fit after {patience:.0f} s ({reasons})")
         time.sleep(0.05)
+
+
+def _strangers(client: Client) -> dict[str, str]:
+    """Workers on which this package, or one like it, is not installed, with the reason."""
+    answers = client.run(description, on_error="return")
+    return {
+        address: f"nerfvol cannot be used there ({type(answer).__name__}: {answer})"
+        for address, answer in answers.items()
+        if isinstance(answer, BaseException)
+    }
 
 
 def _refused(client: Client, resource: str, workers: dict[str, Any]) -> dict[str, str]:

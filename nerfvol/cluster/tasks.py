@@ -17,13 +17,14 @@ from nerfvol.cluster.ship import Shipped, find
 class Job:
     """A function for many items. function: "module:name", called as ``function(settings, files, item)`` for each item.
 
-    settings: JSON-able, the same for all; files: by name, handed over as paths on the machine that runs it.
-    The function's results must not depend on the machine's threads or on what it did before.
+    settings: JSON-able, the same for all; files: by name, handed over as paths on the machine that runs it; threads:
+    "module:name", told how many threads the function may use. Results must not depend on threads or on what was done before.
     """
 
     function: str
     settings: dict[str, Any]
     files: dict[str, Shipped] = field(default_factory=dict)
+    threads: str = "nerfvol.kernels.ops:set_threads"
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,9 @@ def run(job: Job, items: Sequence[Any], resource: str) -> Done | Missing:
 
     from distributed import Reschedule, get_worker
 
-    from nerfvol.kernels import ops
-
     worker = get_worker()
     # The resource lets one task in at a time, which may have all the threads of its worker.
-    ops.set_threads(max(1, worker.state.nthreads))
+    named(job.threads)(max(1, worker.state.nthreads))
     try:
         paths: dict[str, Path] = {}
         missing = []

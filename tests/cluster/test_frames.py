@@ -114,6 +114,35 @@ def test_a_synthetic_set_from_workers_is_that_from_here(tmp_path, command):
     assert names == sorted(path.name for path in (tmp_path / "there").iterdir())
 
 
+def test_a_large_path_traced_picture_is_shared_by_workers(tmp_path, command, monkeypatch):
+    """Cut into bands and blocks here; 40 samples are three blocks, the last of eight."""
+    pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
+    from data_synth import parts
+    from nerfvol.cluster.window import Window
+
+    for name, value in {"WHOLE_RAYS": 100, "PART_RAYS": 12 * 4 * 16, "PART_PIXELS": 50}.items():
+        monkeypatch.setattr(parts, name, value)
+    given, asked = ("synth", "sphere", "--size", "12x10", "--integrator", "path", "--spp", "40"), []
+    results = Window.results
+    monkeypatch.setattr(Window, "results", lambda self, items: asked.extend(items) or results(self, items))
+    assert command(*given, "--picture", tmp_path / "here.png")[0] == 0
+    assert command(*given, "--picture", tmp_path / "there.png", "--cluster", "local:2")[0] == 0
+    assert len({piece.part for piece in asked}) == len(asked) > 4
+    assert (tmp_path / "there.png").read_bytes() == (tmp_path / "here.png").read_bytes()
+
+
 def test_an_engine_that_is_not_there_is_one_sentence(tmp_path, models, command):
     code, _, said = command("render", models / "octree.safetensors", *PATH, "--out", tmp_path, "--cluster", "nowhere")
     assert code == 2 and "--cluster: expected local:N" in said
+    one = (
+        "render",
+        models / "octree.safetensors",
+        "--orbit",
+        "1",
+        "--out",
+        tmp_path / "one.png",
+        "--cluster",
+        "local:2",
+    )
+    code, _, said = command(*one)
+    assert code == 2 and "--cluster shares out views" in said

@@ -1,6 +1,8 @@
 """Functions that the tests' workers run: importable, as every task must be."""
 
 import os
+import signal
+import threading
 import time
 from pathlib import Path
 
@@ -41,3 +43,46 @@ def other_probe() -> bytes:
 def keep_files_in(folder: str) -> None:
     """This process keeps what it is sent there."""
     os.environ["NERFVOL_CACHE"] = folder
+
+
+def noise(settings: dict, files: dict, item: int) -> bytes:
+    """Some bytes that nothing packs."""
+    return os.urandom(settings["bytes"])
+
+
+_AS_IT_WAS: list[tuple[object, str, object]] = []
+
+
+def die_once_in(phase: str, marker: str) -> None:
+    """The first process that comes to ``phase`` of drawing a frame (load, frame, encode, fetch) makes the file ``marker`` and
+    is killed; others, or another phase: all is as it was."""
+    from nerfvol import film
+    from nerfvol.cluster import frames, tasks
+
+    while _AS_IT_WAS:
+        setattr(*_AS_IT_WAS.pop())
+    frames._film.cache_clear()
+    places = {
+        "load": (frames, "load_model"),
+        "frame": (film.Film, "drawn"),
+        "encode": (film.pictures, "encode_png"),
+        "fetch": (tasks, "Done"),
+    }
+    if phase not in places:
+        return
+    owner, name = places[phase]
+    real = getattr(owner, name)
+
+    def deadly(*arguments, **options):
+        try:
+            with open(marker, "x"):
+                pass
+        except FileExistsError:
+            return real(*arguments, **options)
+        if phase == "fetch":  # the result is there, and perhaps on its way
+            threading.Timer(0.002, os.kill, (os.getpid(), signal.SIGKILL)).start()
+            return real(*arguments, **options)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    _AS_IT_WAS.append((owner, name, real))
+    setattr(owner, name, deadly)

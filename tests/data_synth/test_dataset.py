@@ -22,10 +22,10 @@ from data_synth import (
     transmittance,
     write_dataset,
 )
-from data_synth.cli import main
-from data_synth.dataset import render_view
+from data_synth.cli import main, render_task
 from data_synth.image import Picture, linear_to_srgb, read_exr, srgb_to_linear, write_exr
 from data_synth.scenes.showcase import Showcase, edge_pixels
+from data_synth.views import render_view
 
 
 @pytest.fixture(scope="module")
@@ -175,11 +175,11 @@ def test_a_set_that_was_stopped_goes_on_and_never_stands_beside_another_ones_tra
     class Killed(Exception):
         pass
 
-    def killed_after_two(render, views):
-        for k, view in enumerate(views):
+    def killed_after_two(pieces):
+        for k, piece in enumerate(pieces):
             if k == 2:
                 raise Killed
-            yield render(view)
+            yield render_task({"argv": [*SLAB, "--seed", "5"]}, {}, piece)
 
     with pytest.raises(Killed):
         main([*SLAB, "--seed", "5", "--out", str(out)], killed_after_two)
@@ -196,7 +196,7 @@ def test_every_view_has_a_seed_of_its_own_whoever_renders_it(tmp_path, monkeypat
         seen.setdefault(camera.c2w.tobytes(), []).append(seed)
         return render_view(scene, camera, integrator, seed)
 
-    monkeypatch.setattr("data_synth.dataset.render_view", watched)
+    monkeypatch.setattr("data_synth.views.render_view", watched)
     write_dataset(scenes.slab(), tmp_path / "all", Options(3, (4, 4), seed=2))
     write_dataset(scenes.slab(), tmp_path / "some", Options(3, (4, 4), seed=2, chosen=(1, 5, 2)))
     seeds = list(seen.values())
