@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from data_synth import gather, march, path, shadowmap
+from data_synth import compiled, gather, march, path, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.gather import Gathered
@@ -123,12 +123,14 @@ class Path:
     """Volumetric path tracing: ``spp`` paths per pixel. max_depth: the most scattering events of a path (1 = single).
 
     Without max_depth there is no limit: Russian roulette ends paths, and all orders of scattering are there.
-    jitter: paths start anywhere in the pixel (a box filter) instead of at its centre.
+    jitter: paths start anywhere in the pixel (a box filter) instead of at its centre. textbook: by ``path.py`` in any case,
+    also where the core in C++ (``compiled.py``) knows all that is in the scene.
     """
 
     spp: int = 32
     max_depth: int | None = None
     jitter: bool = True
+    textbook: bool = False
 
     def __post_init__(self) -> None:
         if self.spp < 1:
@@ -141,6 +143,9 @@ class Path:
         out, data = np.empty((camera.height, camera.width, 8)), camera.data()
         depth = UNLIMITED if self.max_depth is None else self.max_depth
         settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed)
+        if not self.textbook and compiled.core() is not None and not compiled.unknown(world):
+            compiled.trace(world, data, settings, out)
+            return Picture(out[..., :3], out[..., 3], out[..., 4], out[..., 5:8], self.spp)
 
         def rows(first: int, last: int) -> None:
             path.render_rows(world, data, settings, new_rng(0, 0), out, first, last)
