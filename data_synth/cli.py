@@ -22,6 +22,7 @@ from data_synth.errors import InputError, RenderWarning
 from data_synth.image import encode_png, write_png
 from data_synth.integrators import Integrator
 from data_synth.jit import say_when_compiling
+from data_synth.portrait import portrait
 from data_synth.scene import Scene
 
 OWN = {key: "--" + key.replace("_", "-") for key in ("spp", "max_depth", "beams", "side", "resolution", "fill")}
@@ -45,7 +46,7 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     what = "a scene by name, a scene file (.yaml), 'list' for all scenes, or 'bench' [one|sky|...]"
     p.add_argument("scene", metavar="SCENE", help=what)
     p.add_argument("--out", metavar="DIR", help="folder to write (made if it is not there)")
-    p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png with a backdrop")
+    p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png, framed and exposed")
     p.add_argument(
         "--views", type=int, default=60, metavar="N", help="training views; val and test are added (default 60)"
     )
@@ -69,6 +70,7 @@ def parser(details: str = "") -> argparse.ArgumentParser:
         metavar="FILE",
         help="a density volume (.vdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
     )
+    p.add_argument("--denoise", action="store_true", help="with --picture: without noise, by Open Image Denoise (an extra)")
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
     p.add_argument("--frames", metavar="A-B[/S]", help="only these of all views (training, validation, test, from 0), and of "
                    "these those that are not there yet: many processes can share a folder")  # fmt: skip
@@ -207,6 +209,8 @@ def _render(args: argparse.Namespace, each: Each | None) -> int:
     options = Options(args.views, _size(args.size), args.seed, None, args.exr, None, _chosen(args.frames), each)
     if args.picture and (Path(args.picture).suffix not in (".jpg", ".png") or not Path(args.picture).parent.is_dir()):
         raise InputError(f"--picture: expected a .jpg or .png in a folder that exists, got {args.picture}")
+    if args.denoise and not args.picture:
+        raise InputError("--denoise: expected --picture with it; data sets are truth, and that is what is rendered")
     scene = _scene(args)
     integrator = _integrator(args, scene)
     if args.picture:
@@ -248,13 +252,15 @@ def probe(what: str) -> bytes:
 
 
 def _portrait(scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace) -> int:
-    """One view from the middle of the scene's viewing band, over a pale backdrop that darkens downwards."""
+    """One view from the middle of the scene's viewing band, as ``portrait.py`` makes it."""
     started = time.perf_counter()
     camera = scene.viewpoints.camera(-55.0, 0.5 * sum(scene.viewpoints.elevation) - 5.0, *size)
-    rgba = render_view(scene, camera, integrator, args.seed).rgba8(scene.exposure) / 255.0
-    backdrop = np.linspace(0.93, 0.76, size[1])[:, None, None] * np.array([0.96, 0.985, 1.0])
-    pixels = rgba[..., :3] * rgba[..., 3:] + backdrop * (1.0 - rgba[..., 3:])
-    write_png(args.picture, np.rint(255.0 * pixels).astype(np.uint8))
+    glance = replace(integrator, spp=16) if isinstance(integrator, integrators.Path) else integrator
+    pixels = portrait(
+        lambda view: render_view(scene, view, integrator, args.seed), camera, args.exposure, args.denoise,
+        lambda view: render_view(scene, view, glance, args.seed),
+    )  # fmt: skip
+    write_png(args.picture, pixels)
     print(f"{args.picture}: {scene.name} in {time.perf_counter() - started:.1f} s")
     return 0
 

@@ -54,11 +54,11 @@ SCENES = {
 
 
 def channels(scene, textbook, spp, runs, max_depth=None, view=None):
-    """(runs, H, W, 8): every channel of pictures with different seeds, the variance as the last three."""
+    """(runs, H, W, 8): every channel of pictures with different seeds; the last three: the variance of a path."""
     path, out = Path(spp=spp, max_depth=max_depth, textbook=textbook), []
     for seed in range(runs):
         p = path.render(scene, view or camera(), seed=(7000 if textbook else 0) + seed)
-        out.append(np.concatenate([p.rgb, p.alpha[..., None], p.distance[..., None], p.variance], axis=-1))
+        out.append(np.concatenate([p.rgb, p.alpha[..., None], p.distance[..., None], spp * p.variance], axis=-1))
     return np.array(out)
 
 

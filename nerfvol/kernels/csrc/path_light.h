@@ -60,6 +60,7 @@ struct Light {
 struct Lights {
     std::vector<Light> rows;
     std::vector<int> points;                                  // which of them are points
+    bool sky = false;
     Lights(const PathScene& s) {
         for (int k = 0; k < s.n_lights; ++k) {
             const double* row = s.lights + k * kLightColumns;
@@ -68,6 +69,7 @@ struct Lights {
                 for (int c = 0; c < 3; ++c) l.a[c] = float(row[7 + c] - s.medium.lo[c]);
                 points.push_back(k);
             }
+            sky = sky || l.kind == kSkyLight;
             rows.push_back(l);
         }
     }

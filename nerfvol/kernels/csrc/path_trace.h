@@ -113,12 +113,19 @@ template <int kKind, bool kGrey> struct Tracer {
         float pdf = 0.0f;
         bool straight = true;
         const f4 ones = splat4(1.0f);
+        const float lost = 1.0f - m.albedo.rows[0][0];
         for (int64_t depth = 0;;) {
             const Path3 r = m.ray(w, d);
             const float edge = m.leaves(r);
             if (!lights.points.empty() && depth < max_depth && edge > 0.0f) L += beta * in_segment(r, edge, beta, random);
             const float t = walk<kKind>(m, r, edge, random, [&](float at, float rho, const Place& p, float u) {
                 if (rho <= 0.0f) return false;
+                if (kGrey && m.plain) {
+                    const float kept = 1.0f - rho * lost;
+                    if (straight) far += double(mean3(beta) * rho * lost) * (base + double(at));
+                    beta *= kept;
+                    return u * kept < rho - rho * lost;
+                }
                 const float a = m.albedo.rows.size() > 1 || m.glows ? attribute(m, p) : 0.0f;
                 const f4 collide = rho * m.relative, albedo = m.albedo.at(a), absorbed = beta * collide * (ones - albedo);
                 if (m.glows) L += absorbed * m.Le.at(a);
@@ -149,7 +156,7 @@ template <int kKind, bool kGrey> struct Tracer {
             w = r.w + t * r.v;
             if (lights.count()) L += next_event(r, t, edge, w, beta, random);
             const f4 wi = scattered(m, d, random);
-            pdf = phase_function(m, d, wi);
+            if (lights.sky) pdf = phase_function(m, d, wi);
             d = wi;
             if (++depth > kRouletteDepth) {
                 const float most = largest(beta), limit = depth < kLong ? 1.0f : 0.99f, q = most < limit ? most : limit;
