@@ -75,7 +75,11 @@ def trace(w: World, camera: CameraData, settings: Settings, out: np.ndarray) -> 
 
 def _arrays(m: Medium) -> dict[str, Any]:
     edge = BRICK if m.kind == GRID else 1
-    size = [edge * c for c in m.cell] if m.kind == GRID else [(b - a) / n for a, b, n in zip(m.lo, m.hi, m.bricks, strict=True)]
+    size = (
+        [edge * c for c in m.cell]
+        if m.kind == GRID
+        else [(b - a) / n for a, b, n in zip(m.lo, m.hi, m.bricks, strict=True)]
+    )
     numbers = [*m.lo, *m.hi, *size, *m.sigma_t, m.falloff, m.phase.g1, m.phase.g2, m.phase.mix]
     return {
         "numbers": np.array(numbers, float),

@@ -28,7 +28,7 @@ def exposure_for(picture: Picture) -> float:
     if not straight.size or not straight.max() > 0.0:
         return 1.0
     luminance = straight @ np.array([0.2126, 0.7152, 0.0722])
-    return float(1.6 / max(np.quantile(luminance, WHITE), 1e-12))
+    return float(0.75 / max(np.quantile(luminance, WHITE), 1e-12))
 
 
 def framed(camera: Camera, alpha: np.ndarray) -> Camera:
@@ -59,17 +59,18 @@ def denoised(picture: Picture) -> Picture:
     except (ImportError, OSError) as error:
         raise InputError(f"--denoise: expected 'pip install nerfvol[denoise]' to have been done ({error})") from error
     rgb = np.ascontiguousarray(picture.rgb, np.float32)
-    alpha = np.repeat(np.asarray(picture.alpha, np.float32)[..., None], 3, axis=-1)
-    clean = pyoidn.denoise(rgb, albedo=alpha, hdr=True)
-    return replace(picture, rgb=np.maximum(np.asarray(clean, float), 0.0), variance=None)
+    alpha = pyoidn.denoise(np.repeat(np.asarray(picture.alpha, np.float32)[..., None], 3, axis=-1))
+    clean = pyoidn.denoise(rgb, albedo=np.ascontiguousarray(alpha), hdr=True, clean_aux=True)
+    alpha = np.clip(np.asarray(alpha[..., 0], float), 0.0, 1.0)
+    return replace(picture, rgb=np.maximum(np.asarray(clean, float), 0.0), alpha=alpha, variance=None)
 
 
 def backdrop(height: int, width: int) -> np.ndarray:
     """(H, W, 3) linear display light: a wall that is lit from above."""
     y, x = np.mgrid[0:height, 0:width]
     away = np.hypot((x + 0.5) / width - 0.5, (y + 0.5) / height - 0.42)
-    level = 0.62 - 0.62 * away**1.3
-    return level[..., None] * np.array([0.80, 0.90, 1.0])
+    level = 0.42 - 0.36 * away**1.3
+    return level[..., None] * np.array([0.50, 0.72, 1.0])
 
 
 def portrait(
@@ -82,7 +83,10 @@ def portrait(
     """
     small = max(64 / max(camera.width, camera.height), 1 / min(camera.width, camera.height))
     glance = replace(
-        camera, width=max(int(camera.width * small), 1), height=max(int(camera.height * small), 1), focal=camera.focal * small
+        camera,
+        width=max(int(camera.width * small), 1),
+        height=max(int(camera.height * small), 1),
+        focal=camera.focal * small,
     )
     picture = render(framed(camera, (preview or render)(glance).alpha))
     if denoise:

@@ -100,7 +100,9 @@ WHITE = [
 ]
 
 
-@pytest.mark.parametrize("name", [] if compiled.core() is None else importlib.import_module("_nerfvol_kernels").available_isas())
+@pytest.mark.parametrize(
+    "name", [] if compiled.core() is None else importlib.import_module("_nerfvol_kernels").available_isas()
+)
 @pytest.mark.parametrize("medium", WHITE)
 def test_white_furnace(medium, name):
     """What loses nothing disappears in a constant sky, on every instruction set."""
@@ -108,7 +110,9 @@ def test_white_furnace(medium, name):
     before = kernels.isa()
     try:
         assert kernels.set_isa(name)
-        p = Path(spp=4000).render(Scene(medium=medium, lights=[lights.environment((0.7, 0.4, 0.2))], opaque_sky=True), camera())
+        p = Path(spp=4000).render(
+            Scene(medium=medium, lights=[lights.environment((0.7, 0.4, 0.2))], opaque_sky=True), camera()
+        )
     finally:
         kernels.set_isa(before)
     assert_means(p.rgb, np.maximum(p.variance, ROUNDING**2), (0.7, 0.4, 0.2), bias=ROUNDING)
@@ -145,7 +149,9 @@ def test_rays_along_edges_between_bricks(eye, lo):
     if lo < 0:
         assert_means(p.rgb, p.variance, 1 - np.exp(-4.0), bias=ROUNDING)
     else:  # rounding decides whether an edge is inside
-        assert p.rgb.max() < 1e-9 or abs(p.rgb[0, 0, 0] - (1 - np.exp(-2.0))) < 5 * np.sqrt(p.variance[0, 0, 0]) + ROUNDING
+        assert (
+            p.rgb.max() < 1e-9 or abs(p.rgb[0, 0, 0] - (1 - np.exp(-2.0))) < 5 * np.sqrt(p.variance[0, 0, 0]) + ROUNDING
+        )
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
@@ -190,7 +196,9 @@ def test_seeds_pixels_and_paths_are_independent():
     for x, y in pairs:
         # of n pairs the correlation has a deviation of 1 / sqrt(n)
         assert abs(np.corrcoef(x, y)[0, 1]) * np.sqrt(x.size) < stats.norm.isf(0.5 * sidak(1e-4, len(pairs)))
-    assert not np.array_equal(Path(spp=1).render(scene, view, seed=2**63).rgb, Path(spp=1).render(scene, view, seed=0).rgb)
+    assert not np.array_equal(
+        Path(spp=1).render(scene, view, seed=2**63).rgb, Path(spp=1).render(scene, view, seed=0).rgb
+    )
 
 
 def test_means_of_seeds_scatter_as_their_variance_says():
