@@ -46,7 +46,9 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     what = "a scene by name, a scene file (.yaml), 'list' for all scenes, or 'bench' [one|sky|...]"
     p.add_argument("scene", metavar="SCENE", help=what)
     p.add_argument("--out", metavar="DIR", help="folder to write (made if it is not there)")
-    p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png, framed and exposed")
+    p.add_argument(
+        "--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png, framed and exposed"
+    )
     p.add_argument(
         "--views", type=int, default=60, metavar="N", help="training views; val and test are added (default 60)"
     )
@@ -70,7 +72,9 @@ def parser(details: str = "") -> argparse.ArgumentParser:
         metavar="FILE",
         help="a density volume (.vdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
     )
-    p.add_argument("--denoise", action="store_true", help="with --picture: without noise, by Open Image Denoise (an extra)")
+    p.add_argument(
+        "--denoise", action="store_true", help="with --picture: without noise, by Open Image Denoise (an extra)"
+    )
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
     p.add_argument("--frames", metavar="A-B[/S]", help="only these of all views (training, validation, test, from 0), and of "
                    "these those that are not there yet: many processes can share a folder")  # fmt: skip

@@ -32,7 +32,7 @@ def exposure_for(picture: Picture) -> float:
 
 
 def framed(camera: Camera, alpha: np.ndarray) -> Camera:
-    """A camera in the same place that has what ``alpha`` (any size, seen by ``camera``) shows in its middle, just large enough."""
+    """A camera in the same place that shows what ``alpha`` (any size, seen by ``camera``) holds in its middle, just large enough."""
     rows, columns = (np.flatnonzero((alpha > SEEN).any(axis=a)) for a in (1, 0))
     if not len(rows):
         return camera

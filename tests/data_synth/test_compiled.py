@@ -75,8 +75,10 @@ def assert_alike(a, b, alpha=1e-4):
         assert (t <= limit).all(), f"t = {t.max():.2f} of {t.size}, limit there {limit[np.argmax(t)]:.2f}"
 
 
-@pytest.mark.parametrize("name, depth", [*itertools.product(SCENES, (None,)), ("grey grid, sun", 0), ("points in and beside it", 1),
-                                         ("glowing grid with tables, Rayleigh", 2)])  # fmt: skip
+DEPTHS = [("grey grid, sun", 0), ("points in and beside it", 1), ("glowing grid with tables, Rayleigh", 2)]
+
+
+@pytest.mark.parametrize("name, depth", [*itertools.product(SCENES, (None,)), *DEPTHS])
 def test_it_agrees_with_the_textbook(name, depth):
     medium, lit = SCENES[name]
     scene = Scene(medium=medium, lights=lit)
@@ -233,12 +235,17 @@ def test_what_it_does_not_know_goes_to_the_textbook(what, monkeypatch):
 def test_damaged_arrays_are_refused():
     scene = Scene(medium=WHITE[0], lights=[SUN])
     good = compiled._arrays(scene.world().medium)
-    rest = {"lights": np.ascontiguousarray(scene.world().lights), "camera": np.zeros(16), "spp": 1, "max_depth": 1, "jitter": True,
-            "opaque_sky": False, "seed": 0, "first": 0, "out": np.zeros((1, 1, 8))}  # fmt: skip
+    rest = {
+        "lights": np.ascontiguousarray(scene.world().lights), "camera": np.zeros(16), "spp": 1, "max_depth": 1,
+        "jitter": True, "opaque_sky": False, "seed": 0, "first": 0, "out": np.zeros((1, 1, 8)),
+    }  # fmt: skip
     compiled.core()(**good, **rest | {"camera": np.ones(16)})
-    for name, value in (("offsets", good["offsets"] + 1), ("offsets", good["offsets"][:-1]), ("samples", good["samples"][:-1]),
-                        ("brick_max", good["brick_max"][1:]), ("albedo", np.zeros((0, 3))), ("whole", np.array([7, 0, 1, 1, 1])),
-                        ("whole", np.array([1, 0, 1, 1, 1])), ("attributes", np.zeros(3, np.float32))):  # fmt: skip
+    damaged = [
+        ("offsets", good["offsets"] + 1), ("offsets", good["offsets"][:-1]), ("samples", good["samples"][:-1]),
+        ("brick_max", good["brick_max"][1:]), ("albedo", np.zeros((0, 3))), ("whole", np.array([7, 0, 1, 1, 1])),
+        ("whole", np.array([1, 0, 1, 1, 1])), ("attributes", np.zeros(3, np.float32)),
+    ]  # fmt: skip
+    for name, value in damaged:
         with pytest.raises(ValueError):
             compiled.core()(**good | {name: value}, **rest)
     with pytest.raises(ValueError):
