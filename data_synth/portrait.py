@@ -12,7 +12,7 @@ from data_synth.errors import InputError
 from data_synth.image import Picture, linear_to_srgb
 
 MARGIN = 0.08  # of the picture's side, left free around what is in it
-SEEN = 0.02  # alpha above which a pixel counts as something
+STRAY = 0.005  # of all alpha: so much of it may lie beyond each edge of what counts, single specks for example
 WHITE = 0.98  # part of the opaque pixels that stays below the film's shoulder
 
 
@@ -32,10 +32,13 @@ def exposure_for(picture: Picture) -> float:
 
 
 def framed(camera: Camera, alpha: np.ndarray) -> Camera:
-    """A camera in the same place that shows what ``alpha`` (any size, seen by ``camera``) holds in its middle, just large enough."""
-    rows, columns = (np.flatnonzero((alpha > SEEN).any(axis=a)) for a in (1, 0))
-    if not len(rows):
+    """A camera in the same place that shows what ``alpha``, of any size, seen by ``camera``, holds: in the middle and large."""
+    if not alpha.max() > 0.0:
         return camera
+    sums = [np.cumsum(alpha.sum(axis=a)) for a in (1, 0)]
+    rows, columns = (
+        np.flatnonzero((s > STRAY * s[-1]) & (s - np.diff(s, prepend=0) < (1 - STRAY) * s[-1])) for s in sums
+    )
     height, width = alpha.shape
     # edges of what is seen on the plane at distance 1
     x = (np.array([columns[0], columns[-1] + 1]) / width - 0.5) * camera.width / camera.focal

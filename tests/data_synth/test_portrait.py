@@ -9,7 +9,7 @@ import pytest
 from data_synth import InputError, Path, Viewpoints, lights, media, scenes
 from data_synth.cli import main
 from data_synth.image import Picture
-from data_synth.portrait import MARGIN, SEEN, denoised, exposure_for, film, framed, portrait
+from data_synth.portrait import MARGIN, denoised, exposure_for, film, framed, portrait
 from data_synth.scene import Scene
 
 
@@ -34,7 +34,7 @@ def test_framing_puts_what_is_seen_in_the_middle_and_fills_the_picture(centre, s
     camera = scene.viewpoints.camera(-55, 20, *size)
     better = framed(camera, Path(spp=4).render(scene, camera).alpha)
     assert np.array_equal(better.c2w[:3, 3], camera.c2w[:3, 3])
-    seen = Path(spp=8).render(scene, better).alpha > SEEN
+    seen = Path(spp=8).render(scene, better).alpha > 0.1
     free = []
     for axis, n in ((1, size[1]), (0, size[0])):
         at = np.flatnonzero(seen.any(axis=axis))
@@ -45,6 +45,15 @@ def test_framing_puts_what_is_seen_in_the_middle_and_fills_the_picture(centre, s
         free.append(min(low, high))
         assert min(low, high) > MARGIN - slack - 0.02
     assert min(free) < MARGIN + slack + 0.02
+
+
+def test_specks_do_not_count():
+    """One pixel far away from a square does not change the frame."""
+    camera, alpha = Viewpoints().camera(0, 10, 64, 64), np.zeros((64, 64))
+    alpha[20:40, 24:44] = 1.0
+    clean = framed(camera, alpha)
+    alpha[60, 2] = 0.5
+    assert np.allclose(framed(camera, alpha).c2w, clean.c2w) and framed(camera, alpha).focal == clean.focal
 
 
 def test_an_empty_picture_stays_as_it_is():
