@@ -19,7 +19,7 @@ from data_synth.errors import InputError
 from data_synth.integrators import Path
 from data_synth.scene import Scene
 
-SIZE, DEPTH, RUNS = 256, 64, 5
+SIZE, DEPTH, RUNS = 256, 64, 8
 
 
 def theirs(mi: ModuleType, scene: Scene, camera: Camera, spp: int) -> Any:
@@ -88,7 +88,11 @@ def main(scene: Scene) -> None:
     print(f"\npath tracing to {DEPTH} events, one sun, {SIZE}x{SIZE}; Mitsuba {mi.__version__} volpath")
     print("| renderer | paths a pixel | wall s | CPU s | mean | variance of a pixel | variance × CPU s |")
     print("|---|---|---|---|---|---|---|")
-    row("data_synth", 4, lambda seed: Path(spp=4, max_depth=DEPTH).render(scene, camera, seed).rgb)
+    for name, path in (
+        ("data_synth, C++", Path(spp=4, max_depth=DEPTH)),
+        ("data_synth, textbook", Path(spp=4, max_depth=DEPTH, textbook=True)),
+    ):
+        row(name, 4, lambda seed, path=path: path.render(scene, camera, seed).rgb)
     for variant, spp in (("llvm_ad_rgb", 4), ("scalar_rgb", 4)):
         try:
             mi.set_variant(variant)

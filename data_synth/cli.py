@@ -17,11 +17,13 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from data_synth import integrators, scene_file, scenes
+from data_synth.cameras import Camera
 from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture, encode_png, write_png
 from data_synth.integrators import Integrator
 from data_synth.jit import say_when_compiling
+from data_synth.portrait import portrait
 from data_synth.scene import Scene
 from data_synth.views import (
     Each,
@@ -57,7 +59,9 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     what = "a scene by name, a scene file (.yaml), 'list' for all scenes, or 'bench' [one|sky|...]"
     p.add_argument("scene", metavar="SCENE", help=what)
     p.add_argument("--out", metavar="DIR", help="folder to write (made if it is not there)")
-    p.add_argument("--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png with a backdrop")
+    p.add_argument(
+        "--picture", metavar="FILE", help="instead: one portrait of the scene, .jpg or .png, framed and exposed"
+    )
     p.add_argument(
         "--views", type=int, default=60, metavar="N", help="training views; val and test are added (default 60)"
     )
@@ -80,6 +84,9 @@ def parser(details: str = "") -> argparse.ArgumentParser:
         "--volume",
         metavar="FILE",
         help="a density volume (.vdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
+    )
+    p.add_argument(
+        "--denoise", action="store_true", help="with --picture: without noise, by Open Image Denoise (an extra)"
     )
     p.add_argument("--exr", action="store_true", help="also write linear float EXR files")
     p.add_argument("--frames", metavar="A-B[/S]", help="only these of all views (training, validation, test, from 0), and of "
@@ -219,6 +226,8 @@ def _render(args: argparse.Namespace, each: Each | None) -> int:
     options = Options(args.views, _size(args.size), args.seed, None, args.exr, None, _chosen(args.frames), each)
     if args.picture and (Path(args.picture).suffix not in (".jpg", ".png") or not Path(args.picture).parent.is_dir()):
         raise InputError(f"--picture: expected a .jpg or .png in a folder that exists, got {args.picture}")
+    if args.denoise and not args.picture:
+        raise InputError("--denoise: expected --picture with it; data sets are truth, and that is what is rendered")
     scene = _scene(args)
     integrator = _integrator(args, scene)
     if args.picture:
@@ -262,18 +271,21 @@ def probe(what: str) -> bytes:
 def _portrait(
     scene: Renderable, integrator: Integrator | None, size: tuple[int, int], args: argparse.Namespace, each: Each | None
 ) -> int:
-    """One view from the middle of the scene's viewing band, over a pale backdrop that darkens downwards."""
+    """One view from the middle of the scene's viewing band, as ``portrait.py`` makes it."""
     started = time.perf_counter()
     camera = scene.viewpoints.camera(-55.0, 0.5 * sum(scene.viewpoints.elevation) - 5.0, *size)
-    view = View(0, "", camera)
-    if each is None or len(pieces_of(integrator, [view])) == 1:  # too small to share
-        picture = render_numbered(scene, integrator, args.seed, view)
-    else:
-        picture = cast(Picture, next(rendered(each, integrator, [view])))
-    rgba = picture.rgba8(scene.exposure) / 255.0
-    backdrop = np.linspace(0.93, 0.76, size[1])[:, None, None] * np.array([0.96, 0.985, 1.0])
-    pixels = rgba[..., :3] * rgba[..., 3:] + backdrop * (1.0 - rgba[..., 3:])
-    write_png(args.picture, np.rint(255.0 * pixels).astype(np.uint8))
+    glance = replace(integrator, spp=16) if isinstance(integrator, integrators.Path) else integrator
+
+    def whole(camera: Camera) -> Picture:
+        view = View(0, "", camera)
+        if each is None or len(pieces_of(integrator, [view])) == 1:  # too small to share
+            return render_numbered(scene, integrator, args.seed, view)
+        return cast(Picture, next(rendered(each, integrator, [view])))
+
+    pixels = portrait(
+        whole, camera, args.exposure, args.denoise, lambda view: render_view(scene, view, glance, args.seed)
+    )
+    write_png(args.picture, pixels)
     print(f"{args.picture}: {scene.name} in {time.perf_counter() - started:.1f} s")
     return 0
 

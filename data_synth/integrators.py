@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from data_synth import gather, march, parts, path, shadowmap
+from data_synth import compiled, gather, march, parts, path, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.gather import Gathered
@@ -153,12 +153,14 @@ class Path:
     """Volumetric path tracing: ``spp`` paths per pixel. max_depth: the most scattering events of a path (1 = single).
 
     Without max_depth there is no limit: Russian roulette ends paths, and all orders of scattering are there.
-    jitter: paths start anywhere in the pixel (a box filter) instead of at its centre.
+    jitter: paths start anywhere in the pixel (a box filter) instead of at its centre. textbook: by ``path.py`` in any case,
+    also where the core in C++ (``compiled.py``) knows all that is in the scene.
     """
 
     spp: int = 32
     max_depth: int | None = None
     jitter: bool = True
+    textbook: bool = False
 
     def __post_init__(self) -> None:
         if self.spp < 1:
@@ -176,9 +178,11 @@ class Path:
     def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
         """See Integrator; over the samples, of rgb, alpha, distance and the squares of rgb."""
         world = _prepared(self, scene).world
-        out, data = np.empty((camera.height, camera.width, 8)), camera.data()
         depth = UNLIMITED if self.max_depth is None else self.max_depth
         settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed, part.first, part.last)
+        if not self.textbook and compiled.core() is not None and not compiled.unknown(world):
+            return compiled.trace(world, camera.data(), settings, (part.bottom - part.top, camera.width), part.top)
+        out, data = np.empty((camera.height, camera.width, 8)), camera.data()
 
         def rows(first: int, last: int) -> None:
             path.render_rows(world, data, settings, new_rng(0, 0), np.empty((64, 8)), out, first, last)

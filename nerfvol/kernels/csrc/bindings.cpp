@@ -23,6 +23,7 @@
 
 void bind_photographs(nanobind::module_& m);  // sweep_bindings.cpp
 void bind_distilling(nanobind::module_& m);   // distil_bindings.cpp
+void bind_paths(nanobind::module_& m);        // path_bindings.cpp
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -308,6 +309,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.attr("MAX_LEVEL") = kMaxLevel;
     bind_photographs(m);
     bind_distilling(m);
+    bind_paths(m);
     nb::class_<TreeArrays>(m, "Tree").def(
         "__init__", &init_tree,
         "node_mask"_a, "leaf_mask"_a, "first_node"_a, "first_leaf"_a, "corners"_a, "values"_a, "sh_degree"_a, "origin"_a, "size"_a,
