@@ -30,7 +30,7 @@ DARK, SATURATED = 12, 245
 """Of 255: pixels outside say nothing of a ratio."""
 COVERED = 0.8
 """Share of the photographs that must be compared with others."""
-PRIOR = 0.01
+PRIOR = 1e-4
 """Weight of each logarithm's own square, next to a pair's 1."""
 
 
