@@ -20,6 +20,16 @@ def rotations(quats: ArrayLike) -> Float:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
+def rotation_of(vector: ArrayLike) -> Float:
+    """The rotation (3, 3) about the axis ``vector`` (3,) by its length in radians (Rodrigues' formula)."""
+    w = np.asarray(vector, np.float64)
+    k = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+    angle = float(np.linalg.norm(w))
+    if angle < 1e-6:  # sines and cosines of less cancel; the series' next terms are below rounding
+        return np.eye(3) + k + k @ k / 2
+    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * (k @ k)
+
+
 def quaternion(rotation: ArrayLike) -> Float:
     """The unit quaternion (4,) of a rotation matrix (3, 3), through the largest of its four numbers (Shepperd 1978)."""
     m = np.asarray(rotation, np.float64)

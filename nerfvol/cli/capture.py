@@ -169,8 +169,6 @@ def train_model(options: CaptureOptions, out: Path, bar: Bar) -> None:
     else:
         settings = {"data": str(out / SCENE), "out": str(out), "time_budget": options.time_budget, "seed": options.seed,
                     "threads": options.threads}  # fmt: skip
-        if (out / SCENE / "sparse" / "0" / "points3D.bin").is_file():
-            settings["init"] = "points+sweep"  # a model's points alone are few, and begin behind in a short run
         layers.append((settings, "capture"))
     results: Results | None = train(
         assemble(Config, *layers), time.perf_counter(), bar.say, lambda name, done: TrainingBar(bar, done)

@@ -15,6 +15,7 @@ from nerfvol.errors import InputError, shown
 
 LAYERED = "Any option can stand in a YAML file given with --config (time_budget: 2m); the command line wins over it."
 
+POSED = "after a fit of each view's pose, for training moved its cameras too: PSNR {:.2f} dB, SSIM {:.4f}"
 FITTED = "after a colour map fitted to each view (exposure and white balance differ): PSNR {:.2f} dB, SSIM {:.4f}"
 
 

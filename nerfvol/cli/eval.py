@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from nerfvol import __version__
-from nerfvol.cli.command import FITTED, Command, add_drawing, add_target, need, prepare_outputs, set_threads
+from nerfvol.cli.command import FITTED, POSED, Command, add_drawing, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
 from nerfvol.config.values import Colour, Count, fraction, pixels
@@ -70,8 +70,10 @@ def run(options: EvalOptions) -> int:
     set_threads(options.threads)
     from nerfvol.datasets.load import load_dataset
     from nerfvol.files.atomic import write_json
+    from nerfvol.files.run_folder import REFINED
     from nerfvol.measure.perceptual import NETWORK, load_lpips
     from nerfvol.measure.scores import comparison_writer, evaluate
+    from nerfvol.training.refined import with_refined
 
     prepare_outputs(options.save_images, options.json)
     target = open_target(options.target, options.background)
@@ -83,6 +85,8 @@ def run(options: EvalOptions) -> int:
     kind = settings.get("scene")
     scene = "auto" if kind is None else kind
     dataset = load_dataset(data, options.split, options.downscale, holdout=holdout, scene=scene)
+    if options.data is None and options.split == "train":
+        dataset = with_refined(dataset, target.path.parent / REFINED)
     for message in dataset.messages:
         print(message, file=sys.stderr)
     drawing = target.background, options.early_stop_eps, options.lod
@@ -173,7 +177,7 @@ def _record(
     return {
         "psnr": scores["psnr"],
         "ssim": scores["ssim"],
-        **{name: scores[name] for name in ("psnr_fitted", "ssim_fitted") if name in scores},
+        **{name: scores[name] for name in ("psnr_posed", "ssim_posed", "psnr_fitted", "ssim_fitted") if name in scores},
         "n_images": len(scores["rows"]),
         "seconds_per_frame": scores["seconds_per_frame"],
         "image_size": list(sizes[-1]),
@@ -209,6 +213,8 @@ def _print_scores(record: dict[str, Any], split: str) -> None:
         f"PSNR {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}{distance}, {record['seconds_per_frame']:.3f} s per frame "
         f"({record['threads']} threads, {record['kernel_path']})"
     )
+    if "psnr_posed" in record:
+        print(POSED.format(record["psnr_posed"], record["ssim_posed"]))
     if "psnr_fitted" in record:
         print(FITTED.format(record["psnr_fitted"], record["ssim_fitted"]))
 

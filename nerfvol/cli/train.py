@@ -7,7 +7,7 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerfvol.cli.command import FITTED, Command, assemble_options, need, set_threads
+from nerfvol.cli.command import FITTED, POSED, Command, assemble_options, need, set_threads
 from nerfvol.cli.photographs import with_poses
 from nerfvol.cli.terminal import go_on_without_reader
 from nerfvol.config.assemble import read_yaml
@@ -47,6 +47,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "RUN/scene (needs nerfvol[poses]; default: given)")  # fmt: skip
     p.add_argument("--appearance", metavar="auto|on|off", help="a colour map for each photograph; auto: where exposures "
                    "differ by more than 8 %% (default: auto)")  # fmt: skip
+    p.add_argument("--refine-poses", action="store_true", help="move the cameras along the loss's gradient while splats are "
+                   "trained: for poses that are off by more than a pixel or two")  # fmt: skip
     p.add_argument("--threads", metavar="N", help="CPU threads; the result does not depend on it (default: all)")
     p.add_argument("--seed", metavar="N", help="seed of every random choice (default: 0)")
     p.add_argument("--view", action="store_true", help="show the model in the browser while it is trained, a new one after "
@@ -134,6 +136,8 @@ def print_results(results: Results) -> None:
     print(f"\n{metrics['n_images']} held-out views on background {background}: PSNR {metrics['psnr']:.2f} dB, "
           f"SSIM {metrics['ssim']:.4f}; {results.size}, {metrics['MB']:.1f} MB, "
           f"{metrics['seconds_per_frame']:.3f} s per frame, {metrics['seconds']:.0f} s in all")  # fmt: skip
+    if "psnr_posed" in metrics:
+        print(POSED.format(metrics["psnr_posed"], metrics["ssim_posed"]))
     if "psnr_fitted" in metrics:
         print(FITTED.format(metrics["psnr_fitted"], metrics["ssim_fitted"]))
     print(f"model: {results.model}")

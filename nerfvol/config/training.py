@@ -384,6 +384,9 @@ class Config(Checked):
     appearance: Literal["auto", "on", "off"] = "auto"
     """A colour map for each photograph, for exposure and white balance that differ. auto: where exposures spread by more
     than 8 %; off: photographs are taken as they are."""
+    refine_poses: bool = False
+    """Move the cameras along the loss's gradient while splats are trained: for poses of phones' tracking or of few features.
+    Poses of structure from motion gain nothing (docs/photographs.md)."""
     aabb: Annotated[tuple[float, float, float, float, float, float] | None, box] = None
     """The region of detail, lowest and highest corner in the units of the poses; None: worked out from the cameras."""
     holdout: Literal["own", "arc"] = "own"
@@ -428,7 +431,13 @@ class Config(Checked):
         octree = self.octree.for_scene(scene)
         distill = filled(self.distill, {"sh_degree": octree.sh_degree}).for_scene(scene)
         sections = {"octree": octree, "distill": distill, "splats": self.splats.for_scene(scene)}
-        return dataclasses.replace(self, **sections, representation=self._suited(scene))
+        suited = self._suited(scene)
+        if self.refine_poses and suited != "splats":
+            raise InputError(
+                f"--refine-poses moves cameras by the gradients of splats, and what is trained is {suited}: add "
+                "--representation splats, or leave it out"
+            )
+        return dataclasses.replace(self, **sections, representation=suited)
 
     def _suited(self, scene: SceneBounds) -> Literal["octree", "splats", "field"]:
         """The representation as asked for, or the one that suits the start or the scene."""

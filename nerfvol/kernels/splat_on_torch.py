@@ -27,42 +27,49 @@ def render_splats(
 
 def gradient_rows(
     state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions
-) -> tuple[np.ndarray, LossParts]:
-    """Gradient (n, rows) of the loss in float32, and the loss's parts."""
+) -> tuple[np.ndarray, tuple[float, ...], LossParts]:
+    """Gradient (n, rows) of the loss in float32, that in the camera's motion (6,), and the loss's parts."""
     p = Parameters.of(state.splats(), torch.float32, requires_grad=True)
-    parts = splat_reference.loss(p, view, image, options, state.mode)
-    found = torch.autograd.grad(parts.loss, p.tensors(), allow_unused=True) if parts.loss.requires_grad else [None] * 5
-    rows = [torch.zeros_like(a) if g is None else g for a, g in zip(p.tensors(), found, strict=True)]
-    return torch.cat([r.reshape(state.n, -1) for r in rows], dim=1).numpy(), parts
+    motion = torch.zeros(6, requires_grad=True)
+    parts = splat_reference.loss(p, view, image, options, state.mode, motion)
+    asked = (*p.tensors(), motion)
+    found = torch.autograd.grad(parts.loss, asked, allow_unused=True) if parts.loss.requires_grad else [None] * 6
+    rows = [torch.zeros_like(a) if g is None else g for a, g in zip(asked, found, strict=True)]
+    return torch.cat([r.reshape(state.n, -1) for r in rows[:5]], dim=1).numpy(), tuple(rows[5].tolist()), parts
 
 
 def loss_gradient(
     state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions
 ) -> tuple[np.ndarray, SplatReport]:
     """splat_ops.loss_gradient on the reference: (n_blocks, rows, 16) float32; the report is as in :func:`train_step`."""
-    rows, parts = gradient_rows(state, view, image, options)
-    return packing.to_blocks(rows, np.zeros(rows.shape[1], np.float32)), _report(parts)
+    rows, motion, parts = gradient_rows(state, view, image, options)
+    return packing.to_blocks(rows, np.zeros(rows.shape[1], np.float32)), _report(parts, motion)
 
 
-def _report(parts: LossParts) -> SplatReport:
-    return SplatReport(parts.of_pixels, parts.squared_error, int(parts.hit.sum()), 0, 0)
+def _report(parts: LossParts, motion: tuple[float, ...] | None) -> SplatReport:
+    return SplatReport(parts.of_pixels, parts.squared_error, int(parts.hit.sum()), 0, 0, motion)
 
 
 def train_step(
-    state: SplatState, view: SplatView, image: np.ndarray, options: SplatOptions, rates: SplatRates
+    state: SplatState,
+    view: SplatView,
+    image: np.ndarray,
+    options: SplatOptions,
+    rates: SplatRates,
+    motion: bool = False,
 ) -> SplatReport:
     """splat_ops.train_step on the reference, image (H16, W16, 4) uint8; changes ``state`` in place.
 
     ``visible`` counts the splats that were hit, entries and blocks are 0.
     """
-    g, parts = gradient_rows(state, view, image, options)
+    g, moved, parts = gradient_rows(state, view, image, options)
     hit = parts.hit.numpy()
     adam_step(state, g, hit, rates)
     for name, values in (("error", parts.error), ("max_weight", parts.max_weight)):
         total = state.per_splat(name)
         total[:] = total + values.numpy() if name == "error" else np.maximum(total, values.numpy())
     state.per_splat("seen")[hit] += 1
-    return _report(parts)
+    return _report(parts, moved if motion else None)
 
 
 def adam_step(state: SplatState, g: np.ndarray, hit: np.ndarray, rates: SplatRates) -> None:

@@ -157,25 +157,34 @@ def _check_settings(options: SplatOptions, rates: SplatRates) -> None:
 
 
 def train_step(
-    state: SplatState, view: SplatView, image: NDArray[np.uint8], options: SplatOptions, rates: SplatRates
+    state: SplatState,
+    view: SplatView,
+    image: NDArray[np.uint8],
+    options: SplatOptions,
+    rates: SplatRates,
+    motion: bool = False,
 ) -> SplatReport:
     """One Adam step on ``state`` in place, for one view.
 
     image: (H16, W16, 4) uint8, see :func:`pad_image`; straight colours, alpha / 255 is the pixel's weight in the loss.
+    motion: the report has the gradient in the camera's motion as well, before the step; it costs a few per cent.
     Only splats that the view hits are changed, moments included. Bitwise the same for any number of threads.
     """
     image = _check_image(view, image)
     _check_settings(options, rates)
     state.check()
     if native() is None:
-        return _on_torch().train_step(state, view, image, options, rates)
-    return _step(state, view, image, options, rates, None)
+        return _on_torch().train_step(state, view, image, options, rates, motion)
+    return _step(state, view, image, options, rates, None, motion)
 
 
 def loss_gradient(
     state: SplatState, view: SplatView, image: NDArray[np.uint8], options: SplatOptions
 ) -> tuple[NDArray[np.float32], SplatReport]:
-    """Gradient of the loss in ``state.params`` (n_blocks, rows, 16), 0 where a splat was not hit; changes nothing."""
+    """Gradient of the loss in ``state.params`` (n_blocks, rows, 16), 0 where a splat was not hit; changes nothing.
+
+    The report has the gradient in the camera's motion as well.
+    """
     image, rates = _check_image(view, image), SplatRates()
     _check_settings(options, rates)
     state.check()
@@ -183,7 +192,7 @@ def loss_gradient(
     gradient[...] = 0
     if native() is None:
         return _on_torch().loss_gradient(state, view, image, options)
-    return gradient, _step(state, view, image, options, rates, gradient)
+    return gradient, _step(state, view, image, options, rates, gradient, True)
 
 
 def _step(
@@ -193,11 +202,12 @@ def _step(
     options: SplatOptions,
     rates: SplatRates,
     gradient: np.ndarray | None,
+    motion: bool,
 ) -> SplatReport:
     compiled = native()
     assert compiled is not None
     arrays = (state.params, state.n, state.mode == "mip", state.first, state.second, state.updates)
     statistics = (state.error, state.max_weight, state.seen)
     settings = _kernel_settings(options, rates)
-    r = compiled.splat_step(*arrays, *statistics, _kernel_view(view), image, *settings, gradient)
-    return SplatReport(r.loss, r.squared_error, r.visible, r.entries, r.blocks)
+    r = compiled.splat_step(*arrays, *statistics, _kernel_view(view), image, *settings, gradient, motion)
+    return SplatReport(r.loss, r.squared_error, r.visible, r.entries, r.blocks, tuple(r.motion) if motion else None)

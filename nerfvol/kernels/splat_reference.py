@@ -93,10 +93,20 @@ def _slopes(t: Tensor, f: float, c: float, size: int, axis: int) -> Tensor:
     return (t[:, axis] / t[:, 2]).clamp(-c / f - margin, (size - c) / f + margin)
 
 
-def project(p: Parameters, view: SplatView, mode: str) -> Footprints:
-    """How ``view`` sees the splats ``p``."""
+def moved(view: SplatView, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotation (3, 3), translation (3,) and eye (3,) of a view after a motion (w, v) (6,): its axes see what they saw at t at
+    exp([w]) t + v."""
+    rotation, translation = (torch.tensor(a, dtype=motion.dtype) for a in (view.rotation, view.translation))
+    x, y, z, zero = *motion[:3], motion.new_zeros(())
+    turn = torch.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3))
+    rotation, translation = turn @ rotation, turn @ translation + motion[3:]
+    return rotation, translation, -rotation.T @ translation
+
+
+def project(p: Parameters, view: SplatView, mode: str, motion: Tensor | None = None) -> Footprints:
+    """How ``view``, after a ``motion`` (6,) (default: none), sees the splats ``p``."""
     dtype = p.means.dtype
-    rotation, translation = torch.tensor(view.rotation, dtype=dtype), torch.tensor(view.translation, dtype=dtype)
+    rotation, translation, eye = moved(view, torch.zeros(6, dtype=dtype) if motion is None else motion)
     t = p.means @ rotation.T + translation
     x, y, z = t.unbind(-1)
     u, v = _slopes(t, view.fx, view.cx, view.width, 0), _slopes(t, view.fy, view.cy, view.height, 1)
@@ -113,7 +123,7 @@ def project(p: Parameters, view: SplatView, mode: str) -> Footprints:
         flat_det = torch.linalg.cross(a[:, 0], a[:, 1]).square().sum(-1)
         ratio = flat_det / torch.det(covariance)
         opacity = opacity * ratio.clamp_min(LEAST_RHO**2).sqrt()
-    ray = p.means - torch.tensor(view.eye, dtype=dtype)
+    ray = p.means - eye
     direction = ray / ray.norm(dim=-1, keepdim=True)
     colour = eval_colour(p.sh, direction).clamp_min(0)
     shortest = axes[torch.arange(len(axes)), :, p.log_scales.argmin(-1)]
@@ -221,14 +231,22 @@ class LossParts:
     max_weight: Tensor
 
 
-def loss(p: Parameters, view: SplatView, image: np.ndarray, options: SplatOptions, mode: str = "mip") -> LossParts:
-    """What a training step minimises, over the image's pixels with weight m = alpha / 255, M their sum.
+def loss(
+    p: Parameters,
+    view: SplatView,
+    image: np.ndarray,
+    options: SplatOptions,
+    mode: str = "mip",
+    motion: Tensor | None = None,
+) -> LossParts:
+    """What a training step minimises, over the image's pixels with weight m = alpha / 255, M their sum; of the view after a
+    ``motion`` (6,) (default: none).
 
     (1/M) sum m mean_c (l1 |C - t| + squared (C - t)^2)
     + (1/M) ssim sum over blocks without a masked pixel of 16 mean_c (1 - SSIM) / 2
     + scale mean_splats sum s + opacity mean_splats o, the last two for splats that are hit.
     """
-    f = project(p, view, mode)
+    f = project(p, view, mode, motion)
     background = p.means.new_tensor(options.background)
     total, squared = p.means.new_zeros(()), 0.0
     hit = torch.zeros(len(p.means), dtype=torch.bool)

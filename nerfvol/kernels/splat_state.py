@@ -112,13 +112,15 @@ class SplatRates:
 @dataclass(frozen=True)
 class SplatReport:
     """loss: the terms of pixels and of blocks; squared_error: mean over valid pixels and channels; visible: splats in the
-    picture; entries: pairs of splat and tile; blocks: of 4x4 pixels that were drawn."""
+    picture; entries: pairs of splat and tile; blocks: of 4x4 pixels that were drawn; motion: the loss's gradient in a motion
+    of the camera (splat_reference.moved), where it was asked for."""
 
     loss: float
     squared_error: float
     visible: int
     entries: int
     blocks: int
+    motion: tuple[float, ...] | None = None
 
 
 class SplatState:

@@ -20,14 +20,18 @@ from nerfvol.files import pictures
 from nerfvol.kernels import ops
 from nerfvol.measure.colour_fit import apply_map, fit_colour_map
 from nerfvol.measure.metrics import psnr, ssim
+from nerfvol.measure.pose_fit import REFINED, fit_poses
 from nerfvol.models import Model
-from nerfvol.views import depth_range, surface_depth
+from nerfvol.views import SplatModel, depth_range, surface_depth
 
 LARGEST_PSNR = 100.0
 """Equal images have infinite PSNR, which JSON cannot say; an 8-bit image has 100 dB only where it is equal."""
 
 COLOUR_MAPS = "colour_maps"
 """Key of a model's metadata: whether photographs were mapped to one exposure."""
+
+MEANS = ("psnr", "ssim", "psnr_posed", "ssim_posed", "psnr_fitted", "ssim_fitted")
+"""What rows may have and summaries average: plain, after a fit of the view's pose, and after one of its colours (there)."""
 
 Float = NDArray[np.float32]
 
@@ -38,6 +42,7 @@ def score_views(
     background: Sequence[float],
     on_view: Callable[[int, Float, Float], None] | None = None,
     colour_fit: bool = False,
+    fitted: Sequence[Camera] | None = None,
 ) -> dict[str, Any]:
     """Scores of ``render`` (camera -> (H, W, 3) float32) against every image of ``dataset`` over ``background``.
 
@@ -45,12 +50,17 @@ def score_views(
     seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that masks leave out,
     or that the lens does not reach, take no part; views of which nothing is left have no row. ``colour_fit``: also
     psnr_fitted and ssim_fitted, of the render after the colour map that brings it nearest to the photograph
-    (measure.colour_fit): without what the camera's exposure and white balance do.
+    (measure.colour_fit): without what the camera's exposure and white balance do. ``fitted``: cameras whose poses were fitted
+    to the model (measure.pose_fit): also psnr_posed and ssim_posed, seen from there, and the colour fit is made there.
     """
 
-    def score(rendered: tuple[int, Float, float]) -> dict[str, Any]:
-        index, image, seconds = rendered
-        return score_view(image, dataset, index, background, colour_fit) | {"seconds": seconds}
+    def score(rendered: tuple[int, Float, Float, float]) -> dict[str, Any]:
+        index, image, posed, seconds = rendered
+        if fitted is None:
+            return score_view(image, dataset, index, background, colour_fit) | {"seconds": seconds}
+        there = score_view(posed, dataset, index, background, colour_fit)
+        moved = {f"{name}_posed": there.pop(name) for name in ("psnr", "ssim")}
+        return score_view(image, dataset, index, background, False) | moved | there | {"seconds": seconds}
 
     rows, at_once = [], ops.get_threads()
     scored = scored_views(dataset)
@@ -61,10 +71,11 @@ def score_views(
             started = time.perf_counter()
             image = render(dataset.cameras[index])
             seconds = time.perf_counter() - started
-            few.append((index, np.clip(image, 0.0, 1.0), seconds))
+            posed = image if fitted is None else render(fitted[index])
+            few.append((index, np.clip(image, 0.0, 1.0), np.clip(posed, 0.0, 1.0), seconds))
         rows += map_threads(score, few, at_once)
         if on_view is not None:
-            for index, image, _ in few:
+            for index, _, image, _ in few:
                 on_view(index, dataset.composited(index, background), image)
     return summarised(rows)
 
@@ -97,7 +108,7 @@ def score_view(
 
 def summarised(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """What :func:`score_views` returns of its rows."""
-    means = [name for name in ("psnr", "ssim", "psnr_fitted", "ssim_fitted") if name in rows[0]]
+    means = [name for name in MEANS if name in rows[0]]
     return {
         **{name: statistics.fmean(row[name] for row in rows) for name in means},
         "seconds_per_frame": statistics.median(row["seconds"] for row in rows),
@@ -121,14 +132,18 @@ def evaluate(
 ) -> dict[str, Any]:
     """What :func:`score_views` returns of ``model``, drawn as ``nerfvol render`` draws it (see models.Model.render).
 
-    Models of photographs whose exposure differed are scored after a colour fit as well. ``background``: (3,) in [0, 1].
+    Models of photographs whose exposure differed are scored after a colour fit as well, and models whose cameras were refined
+    after a fit of each view's pose (``on_view`` sees these). ``background``: (3,) in [0, 1].
     ``on_view(index, truth, render)`` sees each pair, both (H, W, 3) float32 in [0, 1].
     """
 
     def render(camera: Camera) -> Float:
         return model.render(camera, background, ("rgb",), early_stop_eps, lod)["rgb"]
 
-    return score_views(render, dataset, background, on_view, has_colour_maps(model))
+    fitted = None
+    if isinstance(model, SplatModel) and REFINED in model.metadata:
+        fitted = fit_poses(model, dataset, background)
+    return score_views(render, dataset, background, on_view, has_colour_maps(model), fitted)
 
 
 def has_colour_maps(model: Model) -> bool:

@@ -7,6 +7,7 @@ needs to know of it. Focal lengths: EXIF states the one that gives the same fiel
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import shutil
@@ -63,22 +64,34 @@ class CameraGroup:
         }  # fmt: skip
 
 
+@functools.cache
+def reads_heif() -> bool:
+    """Whether pillow-heif is installed; Pillow reads HEIC and HEIF from then on."""
+    try:
+        import pillow_heif
+    except ImportError:
+        return False
+    pillow_heif.register_heif_opener()
+    return True
+
+
 def find_photographs(folder: Path) -> list[Path]:
     """The picture files of a folder, in the order of their names; InputError where there are fewer than three."""
     try:
         files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     except OSError as error:
         raise InputError(f"{folder}: expected a folder of photographs or a video, but it cannot be read") from error
-    found = [path for path in files if path.suffix.lower() in SUFFIXES]
+    heif = [path for path in files if path.suffix.lower() in HEIF_SUFFIXES]
+    read = SUFFIXES + HEIF_SUFFIXES if heif and reads_heif() else SUFFIXES
+    found = [path for path in files if path.suffix.lower() in read]
     if not found and (folder / "images").is_dir():
         return find_photographs(folder / "images")
     if len(found) >= 3:
         return found
-    heif = sum(path.suffix.lower() in HEIF_SUFFIXES for path in files)
-    if heif:
+    if heif and not reads_heif():
         raise InputError(
-            f"{folder}: its {heif} HEIC pictures cannot be read; export them as JPEG (phones: camera settings, formats, "
-            '"most compatible")'
+            f"{folder}: its {len(heif)} HEIC pictures need pillow-heif (pip install 'nerfvol[heic]'); or export them as "
+            "JPEG (phones: camera settings, formats, 'most compatible')"
         )
     videos = [path.name for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
     if videos:

@@ -1,4 +1,4 @@
-"""Splats in turned axes: means, the Gaussians' own axes, and the bands of their colours' spherical harmonics."""
+"""Splats in turned axes, of another scale: means, the Gaussians' own axes, the bands of their colours' spherical harmonics."""
 
 from __future__ import annotations
 
@@ -24,6 +24,17 @@ def turned(splats: Splats, rotation: Float) -> Splats:
         quats=product(quaternion(rotation), splats.quats),
         sh=splats.sh.astype(np.float64) @ sh_rotation(splats.sh_degree, rotation).T,
         origin=rotation @ splats.origin,
+    )
+
+
+def similar(splats: Splats, scale: float, rotation: Float, shift: Float) -> Splats:
+    """The splats with every point x moved to ``scale`` R x + ``shift`` (3,), R = ``rotation`` (3, 3)."""
+    out = turned(splats, rotation)
+    return replace(
+        out,
+        means=out.means * np.float32(scale),
+        log_scales=out.log_scales + np.float32(np.log(scale)),
+        origin=scale * out.origin + shift,
     )
 
 

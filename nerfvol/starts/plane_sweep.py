@@ -12,7 +12,7 @@ the nearest such pixel, so that nothing begins empty.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -143,6 +143,27 @@ def depth_maps(views: Sequence[SweepView], near: float, far: float) -> list[Dept
     agreed = [_agreeing(cameras, chosen, k, outputs[0], sure) for k in range(len(chosen))]
     found = zip(chosen, outputs[0], outputs[1], agreed, strict=True)
     return [DepthMap(int(i), inverse_depth, score, confident) for i, inverse_depth, score, confident in found]
+
+
+def matched_pixels(
+    views: Sequence[SweepView], maps: Sequence[DepthMap], near: float, far: float
+) -> Iterator[tuple[int, int, NDArray[np.int64], NDArray[np.int64]]]:
+    """For each map and each view that it was compared with: both views, and flat pixel numbers (m,) of what they share."""
+    cameras = [view.camera for view in views]
+    for found in maps:
+        rows, columns = np.nonzero(found.confident)
+        pixel = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+        here = rows * found.confident.shape[1] + columns
+        for j in neighbours_of(cameras, found.view, 2 / (1 / near + 1 / far)):
+            if j < 0 or not len(rows):
+                continue
+            m = _map(cameras[found.view], cameras[j])
+            x, y, z = m[:9].reshape(3, 3) @ pixel + m[9:, None] * found.inverse_depth[rows, columns].astype(np.float64)
+            height, width = views[j].image.shape[:2]
+            z = np.where(z > 0, z, np.nan)
+            u, v = x / z, y / z
+            seen = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+            yield found.view, int(j), here[seen], v[seen].astype(np.int64) * width + u[seen].astype(np.int64)
 
 
 def neighbours_of(cameras: Sequence[Camera], i: int, depth: float) -> NDArray[np.int64]:

@@ -1,11 +1,13 @@
 """Photographs of different exposure and white balance: a colour map for each, solved in closed form while a run goes on.
 
-Photograph i shows G_i of the scene's colours, a 3x4 map. At a few moments of a run the maps are fitted to what the model
-shows of each view, in small pictures; from then on training sees G_i^-1 of the photograph, while kernels know nothing of it.
+Photograph i shows G_i of the scene's colours, a 3x4 map. They begin as gains, from what the photographs share
+(starts.exposures), and at a few moments of a run they are fitted to what the model shows of each view, in small pictures;
+training sees G_i^-1 of the photograph, while kernels know nothing of it.
 Scene and maps have a gauge: all maps times one, the scene by its inverse, is the same pictures. So the maps are divided by
 their mean, exactly: the mean map is the identity, and the scene has the photographs' mean exposure.
 
-Maps are used where exposures differ by more than SPREAD; else photographs stay as they are, bit for bit.
+Maps are used where exposures differ by more than SPREAD; else photographs stay as they are, bit for bit. Photographs say so
+themselves before the start; only where they share too little to be compared the model is asked, once it shows enough.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.images import UInt8, area_average
 from nerfvol.measure.colour_fit import IDENTITY, SATURATED, apply_map, compose, exposure, fit_colour_map, inverse
+from nerfvol.starts.exposures import Exposures
 
 MOMENTS = (0.05, 0.1, 0.16, 0.23, 0.33, 0.45, 0.6, 0.8)
 """Of a run's progress, at which maps are fitted."""
@@ -32,6 +35,8 @@ LEAST_SHOWN = 0.6
 bright side of a thing for an exposure."""
 AGREEMENT = 0.6
 """Correlation of the exposures of left and right halves from which on these are the photographs' own."""
+SURE = 0.5
+"""Of the spread: the most that pairs of photographs may err by for their exposures to be believed."""
 BRIGHTER = 1.02
 """Exposure of a photograph from which on its saturated pixels, which may be anything from there on, are left out."""
 FITTED_WIDTH = 60
@@ -58,6 +63,17 @@ class Appearance:
         self.rounds, self.active, self.decided = 0, False, False
         self._to_scene = self.maps.copy()
 
+    def begin(self, measured: Exposures | None) -> None:
+        """Takes what was measured before the start; None: nothing could be, the model will be asked."""
+        if measured is None or self.mode == "off":
+            return
+        self.decided = True
+        sure = measured.spread > SPREAD and measured.error < SURE * measured.spread
+        if sure or self.mode == "on":
+            maps = np.repeat(IDENTITY[None], len(self.maps), axis=0)
+            maps[:, range(3), range(3)] = measured.gains
+            self._use(centred(maps))
+
     def due(self, progress: float) -> bool:
         """Whether a fit is due at ``progress`` in [0, 1]; once it was decided that exposures are even, none is."""
         return self.may_change and progress >= MOMENTS[self.rounds]
@@ -75,14 +91,14 @@ class Appearance:
         for i in range(len(self.maps)):
             photograph, shown, weight = seen(i)
             fitted.append(fit_colour_map(shown, photograph, weight))
+            explained.append(share_explained(fitted[-1], shown, photograph, weight))
             if not self.active:
                 middle = photograph.shape[1] // 2
                 sides = (np.s_[:, :middle], np.s_[:, middle:])
-                explained.append(share_explained(fitted[-1], shown, photograph, weight))
                 halves.append([exposure(fit_colour_map(shown[s], photograph[s], weight[s])) for s in sides])
+        if (self.active or self.mode == "auto") and np.median(explained) < LEAST_SHOWN:
+            return False
         if not self.active and self.mode == "auto":
-            if np.median(explained) < LEAST_SHOWN:
-                return False
             self.decided = True
             if not exposures_differ(np.array(halves)):
                 return False

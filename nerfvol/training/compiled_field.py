@@ -180,6 +180,9 @@ class CompiledFieldTrainer:
         """See FinalPhase."""
         return small_picture(self.dataset, i, self.picture)
 
+    def refined(self) -> None:
+        """The cameras stay."""
+
     def take_model(self, metadata: dict[str, Any]) -> FieldModel:
         """The field as it is; Adam's moments stay behind with the trainer."""
         return FieldModel(self.trained_field(), metadata)

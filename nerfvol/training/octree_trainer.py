@@ -136,6 +136,9 @@ class OctreeTrainer:
         """See Phase."""
         return self.plan.outgrown(self.octree) if self.plan else None
 
+    def refined(self) -> None:
+        """The cameras stay."""
+
     def take_model(self, metadata: dict[str, Any]) -> OctreeModel:
         """The finished octree; tiles, moments and statistics are released."""
         octree = self.finish()

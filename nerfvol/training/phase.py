@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.kernels.state import StepReport
@@ -91,6 +93,16 @@ class Phase(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """Training photographs by name, their refined poses (n, 4, 4) in the frame that is trained in, and by how many pixels what
+    they show moved, (n,)."""
+
+    names: list[str]
+    poses: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+
+
 class FinalPhase(Phase, Protocol):
     """A phase whose product is the run's: the last one. ``appearance``: the photographs' colour maps."""
 
@@ -99,6 +111,10 @@ class FinalPhase(Phase, Protocol):
     def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A small picture of training view i as it was taken (h, w, 3), as the model shows it, both in [0, 1], and the
         pixels' weights (h, w)."""
+        ...
+
+    def refined(self) -> RefinedPoses | None:
+        """Where the cameras are in the end; None where they stayed."""
         ...
 
     def take_model(self, metadata: dict[str, Any]) -> Model:

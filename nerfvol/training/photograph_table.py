@@ -22,6 +22,7 @@ from nerfvol.files.atomic import write_text
 from nerfvol.measure.colour_fit import apply_map, exposure
 from nerfvol.measure.sharpness import sharpness
 from nerfvol.training.phase import FinalPhase
+from nerfvol.training.photograph_page import MOST, write_page
 
 JUDGED_SIZE = 320
 """Pixels along the longer side, at least, of pictures whose sharpness is looked at."""
@@ -31,6 +32,8 @@ NEIGHBOURS = 4
 """To each side."""
 ODD_EXPOSURE = 1.4
 """Exposure, or its inverse, from which on a photograph is called bright or dark."""
+OFF_PIXELS = 5.0
+"""Of a refined pose, from which on a photograph's remark says so."""
 BAD_DB, BAD_DEVIATIONS = 3.0, 3.5
 """A photograph is bad that lies so many dB below the median and so many robust deviations."""
 NAMED = 5
@@ -38,25 +41,47 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class Row:
-    """psnr: of a small picture after its colour map, dB; sharpness: of its neighbours' median; exposure: of the mean."""
+    """psnr: of a small picture after its colour map, dB; sharpness: of its neighbours' median; exposure: of the mean; moved: by
+    how many pixels refining its pose moved what it shows, None where poses stayed; index: of the training view."""
 
     name: str
     psnr: float
     sharpness: float
     exposure: float
+    moved: float | None
     remark: str
+    index: int
 
 
 def write_table(path: Path, dataset: Dataset, phase: FinalPhase) -> str:
-    """Writes a row for each training photograph as CSV, the worst first, and returns a sentence for a person."""
-    rows = make_rows(dataset, phase)
+    """Writes a row for each training photograph as CSV, the worst first, and the page of thumbnails beside it; returns a
+    sentence for a person."""
+    rows = sorted(make_rows(dataset, phase), key=lambda row: row.psnr)
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
-    out.writerow(["photograph", "psnr_small_db", "sharpness_of_neighbours", "exposure_of_mean", "remark"])
-    for row in sorted(rows, key=lambda row: row.psnr):
-        out.writerow([row.name, f"{row.psnr:.2f}", f"{row.sharpness:.2f}", f"{row.exposure:.3f}", row.remark])
+    out.writerow(
+        ["photograph", "psnr_small_db", "sharpness_of_neighbours", "exposure_of_mean", "pose_moved_pixels", "remark"]
+    )
+    for row in rows:
+        moved = "" if row.moved is None else f"{row.moved:.2f}"
+        out.writerow([row.name, f"{row.psnr:.2f}", f"{row.sharpness:.2f}", f"{row.exposure:.3f}", moved, row.remark])
     write_text(path, text.getvalue())
-    return advice(rows, path.name)
+    said, page = advice(rows, path.name), path.with_suffix(".html")
+    entries = [(row.name, _known(row), row.remark) for row in rows]
+    write_page(page, f"{len(rows)} photographs", said, entries, (_pictures(phase, row.index) for row in rows[:MOST]))
+    return f"{said.removesuffix(')')}; thumbnails: {page.name})"
+
+
+def _known(row: Row) -> str:
+    moved = "" if row.moved is None else f", pose moved by {row.moved:.1f} pixels"
+    return f"{row.psnr:.1f} dB, sharpness {row.sharpness:.2f} of neighbours', exposure {row.exposure:.2f} of the mean{moved}"
+
+
+def _pictures(phase: FinalPhase, i: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """View i small, as it was taken and as the model shows it; what is masked is black in both."""
+    photograph, shown, weight = phase.seen(i)
+    counts = np.asarray(weight)[..., None] > 0
+    return photograph * counts, np.clip(apply_map(phase.appearance.maps[i], np.clip(shown, 0, 1)), 0, 1) * counts
 
 
 def make_rows(dataset: Dataset, phase: FinalPhase) -> list[Row]:
@@ -65,14 +90,16 @@ def make_rows(dataset: Dataset, phase: FinalPhase) -> list[Row]:
     errors = np.array([_psnr(*phase.seen(i), maps[i]) for i in range(len(dataset))])
     own = dataset.pyramid((1, 1, 1), 1, lambda image: sharpness(_grey(image)))
     sharp = relative_to_neighbours(np.array(own), dataset.names)
-    bad = outliers(errors)
+    bad, refined = outliers(errors), phase.refined()
     rows = []
     for i, name in enumerate(dataset.names):
         gain = exposure(maps[i])
         remarks = ["fits badly"] if bad[i] else []
         remarks += ["blurred"] if sharp[i] < BLURRED else []
         remarks += ["bright"] if gain > ODD_EXPOSURE else ["dark"] if gain < 1 / ODD_EXPOSURE else []
-        rows.append(Row(name, float(errors[i]), float(sharp[i]), gain, ", ".join(remarks)))
+        moved = None if refined is None else float(refined.pixels[i])
+        remarks += ["pose was off"] if moved is not None and moved > OFF_PIXELS else []
+        rows.append(Row(name, float(errors[i]), float(sharp[i]), gain, moved, ", ".join(remarks), i))
     return rows
 
 

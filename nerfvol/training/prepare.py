@@ -29,8 +29,10 @@ from nerfvol.files.run_folder import (
     LOG,
     METRICS,
     PHOTOGRAPHS,
+    PHOTOGRAPHS_PAGE,
     PREVIOUS,
     PRODUCTS,
+    REFINED,
     UNFINISHED,
 )
 from nerfvol.starts.region import region_of_sweep
@@ -43,7 +45,7 @@ COMPARED_SIZE = 200
 """Pixels along the middle of a held-out view on which field and octrees are compared: a field takes seconds for so many."""
 LARGEST_HELD_OUT = 32
 """Views that a run scores itself on; `nerfvol eval` scores all there are."""
-_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG, PHOTOGRAPHS)
+_FILES = (CONFIG, *PRODUCTS, DISTILLED, CHECKPOINT, METRICS, LOG, PHOTOGRAPHS, PHOTOGRAPHS_PAGE, REFINED)
 _FREE = {"data", "poses", "out", "time_budget", "threads", "resume", "checkpoint_every", "storage", "compare_views"}
 """Settings that a resumed run may change; all others have already shaped its numbers."""
 

@@ -42,6 +42,8 @@ EXPECTED_SECONDS_TO_WRITE = 2.0
 """Before there is a representation that tells."""
 TABLE_SECONDS = 0.008
 """For a training photograph's row in the table of photographs."""
+FIT_SECONDS = 0.5
+"""For a held-out view's pose, where cameras are refined."""
 RUNNING = 0.98
 """Memory, per step, of the running error."""
 
@@ -351,7 +353,7 @@ class Run:
             writing
             + self.data.reading
             + TABLE_SECONDS * len(self.data.training)
-            + 1.1 * len(self.data.held_out) * (scoring + rendering),
+            + 1.1 * len(self.data.held_out) * (scoring + rendering + FIT_SECONDS * self.config.refine_poses),
             RESERVE_SHARE * self.config.time_budget,
         )
 

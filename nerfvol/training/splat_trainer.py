@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.cameras.motions import Motions
 from nerfvol.config.splats import SplatConfig
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels import splat_ops
 from nerfvol.kernels.splat_state import SplatOptions, SplatRates, SplatState, view_of
 from nerfvol.kernels.state import StepReport
+from nerfvol.measure.pose_fit import REFINED
 from nerfvol.splats.packing import LOGIT
 from nerfvol.splats.splats import Splats
+from nerfvol.splats.turn import similar
 from nerfvol.training.appearance import Appearance, fitting_factor
+from nerfvol.training.phase import RefinedPoses
 from nerfvol.training.splat_schedule import Schedule, saved_schedule
 from nerfvol.views import SplatModel
 
@@ -31,6 +35,11 @@ VIEWS, SPLITS = 3, 4
 NEAR_SHARE = 0.02
 """Of the subject's distance: what is nearer to a camera is not drawn."""
 SECONDS_TO_WRITE = 0.3
+MOTION_PIXELS, MOTION_DECAY = 0.6, 0.05
+"""Pixels of the present pictures by which a refined camera moves a visit, and the factor at the end: small pictures first,
+which see far, then fine ones."""
+MOTION_FROM = 0.02
+"""Share of progress from which on cameras move, not before every photograph was seen once: fog tells them nothing."""
 
 
 class SplatTrainer:
@@ -52,13 +61,15 @@ class SplatTrainer:
         background: Sequence[float],
         seed: int = 0,
         appearance: Appearance | None = None,
+        refine_poses: bool = False,
     ) -> None:
         """``config`` with a number for each None; ``subject_distance``: the median camera's, scene units; ``appearance``: of
-        the photographs (default: they stay as they are)."""
+        the photographs (default: they stay as they are); ``refine_poses``: cameras move along the loss's gradient."""
         self.photographs, self.config, self.schedule, self.seed = photographs, config, schedule, seed
         self.background = (float(background[0]), float(background[1]), float(background[2]))
         self.subject_distance = subject_distance
         self.appearance = appearance or Appearance(len(photographs), "off")
+        self.motions = Motions(photographs.cameras, subject_distance) if refine_poses else None
         self.state = SplatState(splats)
         self.started_with = self.state.n
         self.steps = config.steps
@@ -107,7 +118,7 @@ class SplatTrainer:
             "seen_since": self.seen_since, "factors": list(self.schedule.factors), "ends": list(self.schedule.ends),
             "most": self.schedule.most, "grown": self.schedule.grown, "subject_distance": self.subject_distance,
             "appearance": self.appearance.state_dict(),
-        }  # fmt: skip
+        } | ({} if self.motions is None else {"motions": self.motions.state_dict()})  # fmt: skip
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continues from :meth:`state_dict` as if nothing had happened."""
@@ -117,6 +128,8 @@ class SplatTrainer:
         self.schedule = saved_schedule(state)
         self.subject_distance = float(state["subject_distance"])
         self.appearance.load_state_dict(state["appearance"])
+        if self.motions is not None:
+            self.motions.load_state_dict(state["motions"])
         if not 0 <= self.stage < len(self.schedule.factors) or min(self.steps_done, self.seen_since) < 0:
             raise ValueError(f"stage {self.stage} and step {self.steps_done} are not in its schedule")
         if min(self.state.n, self.started_with) < 1 or not 0 < self.subject_distance < math.inf:
@@ -137,15 +150,24 @@ class SplatTrainer:
         near = NEAR_SHARE * self.subject_distance
         report = splat_ops.train_step(
             self.state,
-            view_of(view.camera, self.state.origin, near),
+            view_of(self._placed(index, view.camera), self.state.origin, near),
             self.appearance.corrected(index, view.image),
             self._options(),
             self._rates(progress),
+            self.motions is not None,
         )
+        if self.motions is not None and progress >= MOTION_FROM and self.steps_done >= len(self.photographs):
+            self.motions.step(
+                index, report.motion or (), view.camera.intrinsics, MOTION_PIXELS * MOTION_DECAY**progress
+            )
         self.steps_done += 1
         self.seen_since += 1
         pixels = view.image.shape[0] * view.image.shape[1]
         return StepReport(report.squared_error, 16 * report.blocks / pixels)
+
+    def _placed(self, i: int, camera: Camera) -> Camera:
+        """The camera of photograph i where it is now."""
+        return camera if self.motions is None else self.motions.camera(i, camera)
 
     def fit_appearance(self, progress: float) -> None:
         """Fits the photographs' colour maps to what the splats show of small pictures of them."""
@@ -159,7 +181,14 @@ class SplatTrainer:
         canvas = self.photographs.cameras[i].intrinsics
         view = self.photographs.view(i, fitting_factor(canvas.width, canvas.height))
         values = view.image.astype(np.float32) / 255
-        return values[..., :3], self.picture(view.camera), values[..., 3]
+        return values[..., :3], self.picture(self._placed(i, view.camera)), values[..., 3]
+
+    def refined(self) -> RefinedPoses | None:
+        """See FinalPhase."""
+        if self.motions is None:
+            return None
+        lenses = [camera.intrinsics for camera in self.photographs.cameras]
+        return RefinedPoses(list(self.photographs.names), self.motions.put_back(), self.motions.pixels(lenses))
 
     def _next_view(self) -> int:
         """Seed-shuffled epochs."""
@@ -210,10 +239,15 @@ class SplatTrainer:
         return first + n <= self.steps_done
 
     def take_model(self, metadata: dict[str, Any]) -> SplatModel:
-        """The splats without those that are nearly transparent."""
-        splats = self.state.splats()
+        """The splats without those that are nearly transparent; of refined poses, where the given ones put the scene."""
+        splats, own = self.state.splats(), self.metadata()
         seen = _opacity(splats.logits) >= self.config.prune_opacity
-        return SplatModel(splats.select(seen) if seen.any() else splats, {**metadata, **self.metadata()})
+        splats = splats.select(seen) if seen.any() else splats
+        if self.motions is not None:
+            scale, rotation, shift = self.motions.back()
+            splats = similar(splats, scale, rotation, shift)
+            own = {"near": own["near"] * scale, REFINED: self.subject_distance * scale}
+        return SplatModel(splats, {**metadata, **own})
 
 
 def _opacity(logits: np.ndarray) -> np.ndarray:

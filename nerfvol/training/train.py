@@ -33,9 +33,10 @@ from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.files.lock import only_writer
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
-from nerfvol.measure.scores import COLOUR_MAPS, evaluate, score_views
+from nerfvol.measure.scores import COLOUR_MAPS, MEANS, evaluate, score_views
 from nerfvol.models import Model, load_model
 from nerfvol.octree.tree import Octree
+from nerfvol.starts.exposures import measure_exposures
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_start import make_field_trainer, make_final_trainer
@@ -44,6 +45,7 @@ from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
+from nerfvol.training.refined import write_refined
 from nerfvol.training.session import RESERVE_SHARE, Clock, Run, Say, Watch, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
@@ -129,6 +131,8 @@ def _train(
             run.say(write_table(run.folder / run_folder.PHOTOGRAPHS, data.training, phase))
         if appearance.active:
             run.say(appearance.sentence())
+        if (refined := phase.refined()) is not None:
+            run.say(write_refined(run.folder / run_folder.REFINED, refined, data.frame))
         metadata = {COLOUR_MAPS: True} if appearance.active else {}
         trained: list[Model] = [phase.take_model(run.metadata() | metadata)]
         del phase
@@ -167,17 +171,21 @@ def begin_splats(run: Run) -> SplatTrainer:
     announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
     splats, distance = start_splats(run, photographs, schedule.most)
     return SplatTrainer(
-        photographs, splats, config.splats, schedule, distance, run.background, config.seed, appearance_of(run)
-    )
+        photographs, splats, config.splats, schedule, distance, run.background, config.seed, appearance_of(run, photographs),
+        config.refine_poses,
+    )  # fmt: skip
 
 
-def appearance_of(run: Run) -> Appearance:
-    """The colour maps of the run's photographs. Objects whose pictures have the background painted in, as splats see all
-    of them, have none: a map would change the background too."""
-    dataset = run.data.training
-    keeps_alpha = run.config.representation == "octree" and dataset.images[0].shape[2] == 4
+def appearance_of(run: Run, photographs: Photographs | None = None) -> Appearance:
+    """The colour maps of the run's photographs, which say themselves whether they need any. Objects whose pictures have the
+    background painted in, as splats see all of them, have none: a map would change the background too."""
+    dataset, config = run.data.training, run.config
+    keeps_alpha = config.representation == "octree" and dataset.images[0].shape[2] == 4
     mapped = dataset.scene.is_unbounded or keeps_alpha
-    return Appearance(len(dataset), run.config.appearance if mapped else "off")
+    appearance = Appearance(len(dataset), config.appearance if mapped else "off")
+    if appearance.mode != "off" and run.phase != config.representation:  # else the checkpoint knows
+        appearance.begin(measure_exposures(dataset, photographs))
+    return appearance
 
 
 def announce(run: Run, memory: str) -> None:
@@ -316,5 +324,4 @@ def progress_bar(name: str, done: float) -> tqdm[Any]:
 
 def summary(scores: dict[str, Any]) -> dict[str, Any]:
     """Means of the scores, without the rows."""
-    keys = ("psnr", "ssim", "psnr_fitted", "ssim_fitted", "seconds_per_frame")
-    return {key: scores[key] for key in keys if key in scores}
+    return {key: scores[key] for key in (*MEANS, "seconds_per_frame") if key in scores}

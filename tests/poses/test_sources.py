@@ -1,10 +1,13 @@
 """Which pictures a folder holds, upright copies of them, and which camera took them."""
 
+import threading
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from nerfvol.errors import InputError
+from nerfvol.poses import sources
 from nerfvol.poses.sources import camera_groups, copy_photographs, find_photographs
 
 EXIF, FOCAL, FOCAL_35, ORIENTATION, MODEL = 0x8769, 0x920A, 0xA405, 0x0112, 0x0110
@@ -80,12 +83,60 @@ def test_names_that_differ_by_their_ending_do_not_meet(tmp_path):
 
 @pytest.mark.parametrize("files,sentence", [
     ([], "three photographs or more .* holds none"),
-    (["a.heic", "b.HEIC"], "2 HEIC pictures cannot be read; export them as JPEG"),
+    (["a.heic", "b.HEIC"], r"2 HEIC pictures need pillow-heif \(pip install 'nerfvol\[heic\]'\); or export"),
     (["walk.mp4"], "give the video itself: walk.mp4"),
     (["a.jpg"], "holds only 1"),
 ])  # fmt: skip
-def test_what_is_no_folder_of_photographs(tmp_path, files, sentence):
+def test_what_is_no_folder_of_photographs(tmp_path, monkeypatch, files, sentence):
+    monkeypatch.setattr(sources, "reads_heif", lambda: False)
     for name in files:
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(InputError, match=sentence):
         find_photographs(tmp_path)
+
+
+def test_heic_pictures_are_read_where_pillow_heif_is(tmp_path):
+    """As a phone writes them: turned by EXIF, which the copy is not any more."""
+    pytest.importorskip("pillow_heif", reason="needs pillow-heif")
+    assert sources.reads_heif()
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:, :32] = (200, 40, 20)
+    for k in range(3):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        Image.fromarray(picture).save(tmp_path / "in" / f"IMG_{k}.HEIC", format="HEIF", quality=95)
+    paths = find_photographs(tmp_path / "in")
+    copies, bad = copy_photographs(paths, tmp_path / "out", 1000)
+    assert not bad and [c.name for c in copies] == ["IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg"]
+    with Image.open(tmp_path / "out" / "IMG_1.jpg") as copy:
+        assert copy.size == (64, 48) and np.abs(np.asarray(copy)[24, 10].astype(int) - (200, 40, 20)).max() < 12
+
+
+def test_two_thousand_photographs_are_not_in_memory_at_once(tmp_path, monkeypatch):
+    """As many are decoded at a time as there are threads, and nothing of them is kept: bytes are counted, not megabytes of
+    pictures made. The bound is one picture for each thread; all of them would be 2,000."""
+    (tmp_path / "in").mkdir()
+    Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(tmp_path / "in" / "0000.jpg")
+    data = (tmp_path / "in" / "0000.jpg").read_bytes()
+    for k in range(1, 2000):
+        (tmp_path / "in" / f"{k:04d}.jpg").write_bytes(data)
+    held, most, lock = [0], [0], threading.Lock()
+    transpose, resize = sources.ImageOps.exif_transpose, Image.Image.resize
+
+    def counted(image):
+        with lock:
+            held[0] += len(image.getbands()) * image.width * image.height
+            most[0] = max(most[0], held[0])
+        return transpose(image)
+
+    def shrunk(image, *args, **keywords):
+        out = resize(image, *args, **keywords)
+        with lock:
+            held[0] -= len(image.getbands()) * image.width * image.height
+        return out
+
+    monkeypatch.setattr(sources.ImageOps, "exif_transpose", counted)
+    monkeypatch.setattr(Image.Image, "resize", shrunk)
+    monkeypatch.setattr("nerfvol.datasets.images.usable_cores", lambda: 3)
+    copies, bad = copy_photographs(find_photographs(tmp_path / "in"), tmp_path / "out", 20)
+    assert len(copies) == 2000 and not bad and held[0] == 0
+    assert 0 < most[0] <= 3 * 30 * 40 * 3

@@ -133,3 +133,55 @@ def test_depth_of_a_wall_is_the_distance_along_the_ray(isa):
     distance = 2 * np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
     assert np.abs(out["median_depth"] - distance).max() < 1e-5
     assert np.abs(out["depth"] - distance * out["opacity"]).max() < 1e-5
+
+
+# ------------------------------------------------------------------ the camera's motion
+@pytest.mark.parametrize("mode", ["mip", "plain"])
+@pytest.mark.parametrize("basis", [1, 4, 9, 16])
+def test_gradient_in_the_camera_s_motion(isa, basis, mode):
+    """Through means, covariances and the direction of the colours; every clamp acts on some splat."""
+    splats, view, image, _, _ = case("special", basis, mode, "all")
+    motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    parts = splat_reference.loss(Parameters.of(splats), view, image, ALL, mode, motion)
+    (true,) = torch.autograd.grad(parts.loss, motion)
+    state = splat_ops.SplatState(splats)
+    report = splat_ops.train_step(state, view, image, ALL, splat_ops.SplatRates(*[0.0] * 6), motion=True)
+    ours = np.array(report.motion)
+    # A sum over 48 splats of gradients that are right to 1e-5 of the largest each, which may cancel.
+    for part in (slice(0, 3), slice(3, 6)):
+        assert np.abs(ours[part] - true.numpy()[part]).max() <= 1e-4 * np.abs(true.numpy()[part]).max()
+    assert splat_ops.loss_gradient(splat_ops.SplatState(splats), view, image, ALL)[1].motion == report.motion
+    assert splat_ops.train_step(state, view, image, ALL, splat_ops.SplatRates()).motion is None
+
+
+@pytest.mark.parametrize("mode", ["mip", "plain"])
+def test_the_twin_s_motion_against_central_differences(mode):
+    splats, view = random_splats(24, 4, 11, mode, size=0.3), view_of_cube(32, 32)
+    options = splat_ops.SplatOptions(BACKGROUND, 0.0, 1.0, 0.3, 0.02, 0.03, 0.0, 0.0)
+    image = random_image(view, 3)
+    p, motion = Parameters.of(splats), torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    (true,) = torch.autograd.grad(splat_reference.loss(p, view, image, options, mode, motion).loss, motion)
+    for k in range(6):
+        ends = []
+        for h in (1e-7, -1e-7):
+            step = torch.zeros(6, dtype=torch.float64)
+            step[k] = h
+            ends.append(float(splat_reference.loss(p, view, image, options, mode, step).loss))
+        assert (ends[0] - ends[1]) / 2e-7 == pytest.approx(
+            float(true[k]), rel=3e-4, abs=1e-4 * float(true.abs().max())
+        ), k
+
+
+def test_a_moved_view_is_a_moved_scene():
+    """Turning the camera's axes by w about a point and shifting them by v shows the same as the inverse motion of the scene."""
+    view = view_of_cube()
+    motion = torch.tensor([0.1, -0.2, 0.05, 0.3, 0.1, -0.2], dtype=torch.float64)
+    rotation, translation, eye = splat_reference.moved(view, motion)
+    t = torch.tensor([0.4, 0.2, 2.0], dtype=torch.float64)  # in the axes before
+    x = torch.tensor(view.rotation.T) @ (t - torch.tensor(view.translation))
+    w = motion[:3].numpy()
+    angle = np.linalg.norm(w)
+    k = np.cross(w / angle, np.eye(3)).T
+    turn = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    np.testing.assert_allclose((rotation @ x + translation).numpy(), turn @ t.numpy() + motion[3:].numpy(), atol=1e-12)
+    np.testing.assert_allclose((rotation @ eye + translation).numpy(), 0, atol=1e-12)

@@ -214,7 +214,7 @@ def test_models_begin_from_their_points(tmp_path, monkeypatch):
 
     data, _ = colmap_dataset(tmp_path, text=False)
     start = choose_start(data, Photographs(data))
-    assert start.name == "points+sweep" and len(start.cloud) == 3 and "only 3 good points" in start.sentence
+    assert start.name == "points+sweep" and len(start.cloud) == 3 and "3 good points are few" in start.sentence
     monkeypatch.setattr(choose, "FEW_POINTS", 3)
     start = choose_start(data, Photographs(data))
     assert start.name == "points" and "3 of the 5 points" in start.sentence

@@ -83,7 +83,7 @@ void py_render(Params params, int64_t n, bool mip, const SplatView& view, const 
 // With `gradient` the gradient of the loss is written there, 0 where a Gaussian was not hit, and nothing else changes.
 SplatReport py_step(Blocks params, int64_t n, bool mip, Blocks first, Blocks second, PerGaussian updates, PerGaussian error,
                     PerGaussian max_weight, PerGaussian seen, const SplatView& view, In<uint8_t, nb::shape<-1, -1, 4>> image,
-                    const SplatLoss& loss, const SplatRates& rates, std::optional<Blocks> gradient) {
+                    const SplatLoss& loss, const SplatRates& rates, std::optional<Blocks> gradient, bool motion) {
     const Splats splats = make_splats(Params(params), n, mip);
     const auto check = [&](const Blocks& a) {
         require(a.shape(0) == params.shape(0) && a.shape(1) == params.shape(1), "the optimiser's arrays do not fit the splats");
@@ -100,7 +100,7 @@ SplatReport py_step(Blocks params, int64_t n, bool mip, Blocks first, Blocks sec
     require(int64_t(image.shape(0)) == padded(view.height) && int64_t(image.shape(1)) == padded(view.width),
             "the image must have the view's size, padded to multiples of 16");
     const SplatImage target{image.data(), int64_t(image.shape(0)), int64_t(image.shape(1))};
-    const SplatMemory memory{params.data(), first.data(), second.data(), updates.data(), error.data(), max_weight.data(), seen.data(), pointer(gradient)};
+    const SplatMemory memory{params.data(), first.data(), second.data(), updates.data(), error.data(), max_weight.data(), seen.data(), pointer(gradient), motion};
     nb::gil_scoped_release release;
     return splat_kernels().step(splats, view, target, loss, rates, memory);
 }
@@ -141,11 +141,12 @@ void bind_splats(nb::module_& m) {
         .def_rw("most_log_ratio", &SplatRates::most_log_ratio);
     nb::class_<SplatReport>(m, "SplatReport")
         .def_ro("loss", &SplatReport::loss).def_ro("squared_error", &SplatReport::squared_error).def_ro("pixels", &SplatReport::pixels)
-        .def_ro("visible", &SplatReport::visible).def_ro("entries", &SplatReport::entries).def_ro("blocks", &SplatReport::blocks);
+        .def_ro("visible", &SplatReport::visible).def_ro("entries", &SplatReport::entries).def_ro("blocks", &SplatReport::blocks)
+        .def_prop_ro("motion", [](const SplatReport& r) { return std::vector<double>(r.motion, r.motion + 6); });
     m.def("splat_render", &py_render, "params"_a, "n"_a, "mip"_a, "view"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(),
           "opacity"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none(), "surfaces"_a = false);
     m.def("splat_step", &py_step, "params"_a, "n"_a, "mip"_a, "first"_a, "second"_a, "updates"_a, "error"_a, "max_weight"_a,
-          "seen"_a, "view"_a, "image"_a, "loss"_a, "rates"_a, "gradient"_a.none());
+          "seen"_a, "view"_a, "image"_a, "loss"_a, "rates"_a, "gradient"_a.none(), "motion"_a);
     m.def("splat_gather", &py_gather, "blocks"_a, "index"_a, "padding"_a, "out"_a);
     m.def("splat_morton", &py_morton, "params"_a, "middle"_a, "size"_a, "codes"_a);
 }

@@ -53,8 +53,20 @@ inline void chain_rotation(const Projection& p, const f16 (&r)[9], f16* out) {
     for (int i = 0; i < 4; ++i) out[i] = (d[i] - p.q[i] * radial) * p.inv_norm;
 }
 
-// Gradients in means (world), log-scales and quaternions, written to their rows.
-inline void chain_geometry(const Projection& p, const GaussianSums& s, const SplatView& view, bool mip, f16* out) {
+// Gradient in a motion of the camera (see SplatReport) through means and axes: those of t, and of W R by columns.
+inline void chain_motion(const Projection& p, const f16 (&dt)[3], const f16 (&dwr)[9], f16* motion) {
+    cross3(p.t, dt, motion);
+    for (int j = 0; j < 3; ++j) {
+        const f16 axis[3] = {p.wr[j], p.wr[3 + j], p.wr[6 + j]}, d[3] = {dwr[j], dwr[3 + j], dwr[6 + j]};
+        f16 turn[3];
+        cross3(axis, d, turn);
+        for (int i = 0; i < 3; ++i) motion[i] += turn[i];
+        motion[3 + j] = dt[j];
+    }
+}
+
+// Gradients in means (world), log-scales and quaternions, written to their rows; motion (6 vectors): null = not wanted.
+inline void chain_geometry(const Projection& p, const GaussianSums& s, const SplatView& view, bool mip, f16* out, f16* motion) {
     f16 d1[3], d2[3], db[9], dwr[9], dr[9];
     chain_footprint(p, s, mip, d1, d2);
     const f16 jx = p.inv_z * view.fx, jy = p.inv_z * view.fy;
@@ -73,14 +85,15 @@ inline void chain_geometry(const Projection& p, const GaussianSums& s, const Spl
         out[nerfvol::kLogScale + j] = db[j] * p.b[j] + db[3 + j] * p.b[3 + j] + db[6 + j] * p.b[6 + j];
         for (int i = 0; i < 3; ++i) dwr[3 * i + j] = db[3 * i + j] * p.s[j];
     }
+    if (motion) chain_motion(p, dt, dwr, motion);
     for (int k = 0; k < 3; ++k)
         for (int j = 0; j < 3; ++j)
             dr[3 * k + j] = dwr[j] * view.rotation[k] + dwr[3 + j] * view.rotation[3 + k] + dwr[6 + j] * view.rotation[6 + k];
     chain_rotation(p, dr, out + nerfvol::kQuat);
 }
 
-// Gradient in the coefficients; that in the direction is added to the means'.
-template <int K> void chain_colour(const float* block, const SplatView& view, const GaussianSums& s, f16* out) {
+// Gradient in the coefficients; that in the direction is added to the means', and to the motion's: it moves the eye.
+template <int K> void chain_colour(const float* block, const SplatView& view, const GaussianSums& s, f16* out, f16* motion) {
     const Directions d(block, view);
     f16 basis[K], colour[3], g[3], w[K];
     splat_basis<K>(d.x, d.y, d.z, basis);
@@ -98,17 +111,21 @@ template <int K> void chain_colour(const float* block, const SplatView& view, co
     f16 x, y, z;
     splat_basis_slope<K>(d.x, d.y, d.z, w, x, y, z);
     const f16 radial = x * d.x + y * d.y + z * d.z;
-    out[nerfvol::kMean] += (x - d.x * radial) * d.inverse;
-    out[nerfvol::kMean + 1] += (y - d.y * radial) * d.inverse;
-    out[nerfvol::kMean + 2] += (z - d.z * radial) * d.inverse;
+    const f16 moved[3] = {(x - d.x * radial) * d.inverse, (y - d.y * radial) * d.inverse, (z - d.z * radial) * d.inverse};
+    for (int i = 0; i < 3; ++i) {
+        out[nerfvol::kMean + i] += moved[i];
+        const float* w = view.rotation + 3 * i;
+        if (motion) motion[3 + i] += moved[0] * w[0] + moved[1] * w[1] + moved[2] * w[2];
+    }
 }
 
 // The gradient of all parameters of a block, (11 + 3 K) vectors.
-template <int K> void chain_block(const float* block, const SplatView& view, bool mip, const GaussianSums& s, f16* out) {
+template <int K>
+void chain_block(const float* block, const SplatView& view, bool mip, const GaussianSums& s, f16* out, f16* motion) {
     const Projection p(block, view, mip);
-    chain_geometry(p, s, view, mip, out);
+    chain_geometry(p, s, view, mip, out, motion);
     out[nerfvol::kLogit] = (1.0f - p.opacity) * s.h;
-    chain_colour<K>(block, view, s, out);
+    chain_colour<K>(block, view, s, out, motion);
 }
 
 }  // namespace NERFVOL_ISA

@@ -3,6 +3,7 @@
 // Tiles leave lines in slots that lie together for each Gaussian, and every sum has an order fixed by the picture, so the result
 // has the same bits for any number of threads. There are no atomics and no array of gradients.
 #pragma once
+#include <array>
 #include <cmath>
 #include <deque>
 
@@ -112,7 +113,17 @@ template <int K> void update_block(const StepSetting& set, int64_t block, const 
     if (r.most_log_ratio > 0) blunt(m.params + at + 16 * nerfvol::kLogScale, hit, r.most_log_ratio);
 }
 
-template <int K> void finish_block(const StepSetting& set, const Frame& f, const StepLines& lines, int64_t block) {
+// Adds the motion's gradient of the lanes that were hit, in one order.
+inline void add_motion(const f16& lanes, const f16 (&gradient)[6], double (&motion)[6]) {
+    alignas(64) float parts[16];
+    for (int k = 0; k < 6; ++k) {
+        store(parts, select_less(lanes, 0.5f, splat16(0), gradient[k]));
+        for (int lane = 0; lane < 16; ++lane) motion[k] += double(parts[lane]);
+    }
+}
+
+template <int K>
+void finish_block(const StepSetting& set, const Frame& f, const StepLines& lines, int64_t block, double (&motion)[6]) {
     constexpr int kRows = nerfvol::kSh + 3 * K;
     alignas(64) float rows[16][16], hits[16];
     const uint32_t hit = gather_lines(f, lines, block, rows);
@@ -124,8 +135,8 @@ template <int K> void finish_block(const StepSetting& set, const Frame& f, const
                                column(rows, kHxy) * s, column(rows, kHyy) * s,
                                {column(rows, kWg) * s, column(rows, kWg + 1) * s, column(rows, kWg + 2) * s}, splat16(0)};
     const float* p = set.splats.params + block * kRows * 16;
-    f16 gradient[kRows];
-    chain_block<K>(p, set.view, set.splats.mip, sums, gradient);
+    f16 gradient[kRows], moved[6];
+    chain_block<K>(p, set.view, set.splats.mip, sums, gradient, memory.motion ? moved : nullptr);
     const float per_gaussian = 1.0f / float(std::max<int64_t>(set.splats.n, 1));
     for (int j = nerfvol::kLogScale; j < nerfvol::kQuat; ++j)
         gradient[j] += vexp(load<f16>(p + 16 * j)) * (set.loss.scale * per_gaussian);
@@ -133,6 +144,7 @@ template <int K> void finish_block(const StepSetting& set, const Frame& f, const
     gradient[nerfvol::kLogit] += o * (1.0f - o) * (set.loss.opacity * per_gaussian);
     for (int lane = 0; lane < 16; ++lane) hits[lane] = float(hit >> lane & 1);
     const f16 lanes = load<f16>(hits);
+    if (memory.motion) add_motion(lanes, moved, motion);
     if (!memory.gradient) return update_block<K>(set, block, lanes, gradient);
     for (int row = 0; row < kRows; ++row)
         store(memory.gradient + (block * kRows + row) * 16, select_less(lanes, 0.5f, splat16(0), gradient[row]));
@@ -145,6 +157,7 @@ struct StepMemory {
     std::mutex growing;
     std::vector<LossSums> tiles;
     std::vector<int64_t> blocks;
+    std::vector<std::array<double, 6>> motions;   // of each chunk
 
     TileWork& of(int thread) {
         const std::lock_guard<std::mutex> lock(growing);
@@ -166,7 +179,7 @@ inline SplatReport train_tiles(const Frame& f, const SplatView& view, const Spla
         m.tiles[size_t(tile)] = work.sums;
         m.blocks[size_t(tile)] = int64_t(work.n_blocks);
     });
-    SplatReport r{0, 0, 0, f.visible, slots, 0};
+    SplatReport r{0, 0, 0, f.visible, slots, 0, {}};
     for (size_t t = 0; t < size_t(tiles); ++t) {
         r.loss += m.tiles[t].loss;
         r.squared_error += m.tiles[t].squared;
@@ -185,12 +198,18 @@ SplatReport step_basis(const Splats& splats, const SplatView& view, const SplatI
     static StepMemory kept;
     Frame& frame = shared_frame();
     prepare_frame<K>(splats, view, frame, false);
-    const SplatReport report = train_tiles(frame, view, image, loss, kept);
+    SplatReport report = train_tiles(frame, view, image, loss, kept);
     const StepSetting set{splats, view, loss, rates, memory, report.pixels > 0 ? float(1 / report.pixels) : 0.0f};
-    splat_for((splats.n_blocks + kChunk - 1) / kChunk, [&](int chunk, int) {
+    const int64_t chunks = (splats.n_blocks + kChunk - 1) / kChunk;
+    kept.motions.resize(size_t(chunks));
+    splat_for(chunks, [&](int chunk, int) {
         const int64_t last = std::min((int64_t(chunk) + 1) * kChunk, splats.n_blocks);
-        for (int64_t b = int64_t(chunk) * kChunk; b < last; ++b) finish_block<K>(set, frame, kept.lines, b);
+        double motion[6] = {};
+        for (int64_t b = int64_t(chunk) * kChunk; b < last; ++b) finish_block<K>(set, frame, kept.lines, b, motion);
+        std::copy_n(motion, 6, kept.motions[size_t(chunk)].begin());
     });
+    for (const auto& motion : kept.motions)
+        for (size_t k = 0; k < 6; ++k) report.motion[k] += motion[k];
     return report;
 }
 

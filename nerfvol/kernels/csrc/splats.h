@@ -60,12 +60,14 @@ struct SplatMemory {                // (n_blocks, rows, 16) and (n_blocks, 16), 
     float *params, *first, *second, *updates;
     float *error, *max_weight, *seen;
     float* gradient;                // (n_blocks, rows, 16) instead of an update: then nothing else changes
+    bool motion;                    // whether the report has the gradient in the camera's motion
 };
 
 struct SplatReport {
     double loss, squared_error;     // per valid pixel; squared error also per channel
     double pixels;                  // sum of weights
     int64_t visible, entries, blocks;
+    double motion[6];               // gradient of the loss in (w, v), where the camera's axes see t + w x t + v for t
 };
 
 struct SplatKernels {
