@@ -189,11 +189,11 @@ def test_parts_that_hold_nothing_are_no_leaves() -> None:
 
 @pytest.mark.parametrize("n_views", [8, ENOUGH_VIEWS])
 def test_distilled_octrees_show_what_their_field_shows(n_views: int) -> None:
-    """Views that nobody trained on: within 0.3 dB of the field's error, whose rim is two leaves wide, against a truth."""
-    field, truth = Wrapped(haze=0.0, rim=0.03), Wrapped(haze=0.0, rim=0.05)
-    octree, _ = distill(field, DOMAIN, views(truth, n_views, 24), (1, 1, 1), DistillConfig(level=5, coarse_level=3))
+    """Views that nobody trained on: within 0.3 dB of the field, against a truth that is sharper than both."""
+    field, truth = Wrapped(haze=0.0, rim=0.02), Wrapped(haze=0.0, rim=0.01)
+    octree, _ = distill(field, DOMAIN, black_views(n_views), (1, 1, 1), DistillConfig(level=5, coarse_level=3))
     lens = Intrinsics(48, 48, 72, 72, 24, 24)
-    held_out = orbit(3, center=DOMAIN.center, radius=3.0, elevation_deg=40, intrinsics=lens)
+    held_out = orbit(2, center=DOMAIN.center, radius=3.0, elevation_deg=40, intrinsics=lens)
 
     def psnr(image) -> float:
         errors = [np.mean((image(camera) - truth.image(camera, (1, 1, 1))) ** 2) for camera in held_out]
