@@ -192,7 +192,8 @@ class DistillConfig(Checked):
     prune_weight: Weight = 0.005
     """Leaves whose largest rendering weight over the training rays is below are removed; 0 keeps all."""
     max_leaves: Count = 2_000_000
-    """Most candidates; leaves are made coarser until they fit, then ``empty_opacity`` is raised."""
+    """Most candidates: where the finest leaves of all that views need do not fit, the thinnest parts have leaves of twice the
+    size; where those do not fit either, ``empty_opacity`` is raised."""
 
     def for_scene(self, scene: SceneBounds) -> DistillConfig:
         """The same with a number for each None; photographs are scenes with background shells."""

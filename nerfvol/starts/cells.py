@@ -17,9 +17,13 @@ from nerfvol.errors import InputError
 from nerfvol.field.layout import Domain, PointField
 from nerfvol.native import native
 from nerfvol.octree.topology import OFFSETS
+from nerfvol.octree.tree import Octree
+from nerfvol.starts.visible import thickness
 
 CHUNK = 32768
 """Points of one evaluation of the field: what it takes and gives stays in the cache."""
+CHILDREN = 4
+"""Of a cell's eight parts, those that hold a surface: what is reckoned with before they are looked at."""
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
 
 
@@ -43,11 +47,15 @@ class Frame:
         center, size = np.array(domain.center), 2 * domain.half * 2.0**doublings
         return cls(center - size / 2, size, level + doublings, center, domain.half)
 
-    def wanted_level(self, level: int, ijk: np.ndarray) -> np.ndarray:
-        """(n,) finest level wanted in cells (n, 3) of ``level``: one less at each doubling of the distance."""
+    def finer(self, levels: int) -> Frame:
+        """The same with leaves so many levels finer."""
+        return dataclasses.replace(self, finest=self.finest + levels)
+
+    def wanted_level(self, level: int | np.ndarray, ijk: np.ndarray) -> np.ndarray:
+        """(n,) finest level wanted in cells (n, 3) of ``level``, one or (n,): one less at each doubling of the distance."""
         if self.size <= 2 * self.half:  # there are no shells
             return np.full(len(ijk), self.finest)
-        edge = self.size / 2**level
+        edge = self.size / 2.0 ** np.reshape(level, (-1, 1))
         low = self.origin + ijk * edge - self.center
         nearest = np.maximum(np.maximum(low, -(low + edge)), 0).max(1)  # Chebyshev distance of the cell's nearest point
         # Shell k holds distances from 2**(k - 1) to 2**k; the inner cube itself is 0.
@@ -65,11 +73,11 @@ def evaluate(function: Callable[[np.ndarray], np.ndarray], corners: np.ndarray, 
 
 def candidate_cells(
     field: PointField, frame: Frame, config: DistillConfig, messages: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Levels (n,) and positions (n, 3) of the cells that may hold something, at most ``config.max_leaves``.
+) -> tuple[Frame, np.ndarray, np.ndarray]:
+    """Levels (n,) and positions (n, 3) of the cells that may hold something, at most ``config.max_leaves``; and their frame.
 
-    Where they do not fit, all leaves are made coarser: they hold all of a haze, and the octree's training splits them where
-    that pays. Only where the coarsest do not fit either, the thinnest are left out.
+    Where they do not fit, all leaves are made coarser: they hold all of a haze, and are split where it pays
+    (:func:`finer_cells`). Only where the coarsest do not fit either, the thinnest are left out.
 
     Raises:
         InputError: nothing in the field is opaque enough for a leaf.
@@ -79,14 +87,9 @@ def candidate_cells(
     start = min(start, frame.finest, 6 if frame.finest > level else start)
     while (found := _search(field, frame, start, threshold, config.max_leaves)) is None:
         if level > config.coarse_level and frame.finest > start:
-            level, frame = level - 1, dataclasses.replace(frame, finest=frame.finest - 1)
+            level, frame = level - 1, frame.finer(-1)
         else:
             threshold *= 2
-    if level < cast(int, config.level):
-        messages.append(
-            f"the field is hazy: with leaves smaller than 1/{1 << level} of the inner cube it would not fit into "
-            f"{config.max_leaves:,} leaves"
-        )
     if threshold > -math.log1p(-config.empty_opacity):
         messages.append(
             f"the field is hazy: only what is more opaque than {-math.expm1(-threshold):.2g} a leaf fits into "
@@ -97,7 +100,34 @@ def candidate_cells(
             "the field is empty: nothing in it is opaque enough for a leaf; train it longer, check the background "
             "colour and the scene bounds, or use --init direct"
         )
-    return found
+    return frame, *found
+
+
+def finer_cells(
+    field: RadianceField, octree: Octree, frame: Frame, config: DistillConfig
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The leaves of ``octree``, whose finest cells are those of ``frame``, with these split: levels (n,), positions (n, 3), and
+    how many stay whole because the others fill ``config.max_leaves``, the thinnest.
+
+    Of a split leaf's parts those are leaves that hold something or touch one that does.
+    """
+    level, ijk = octree.leaf_level.astype(np.int64), octree.leaf_ijk
+    finest = np.flatnonzero(level == frame.wanted_level(level, ijk))
+    finest = finest[np.argsort(-thickness(octree)[finest], kind="stable")]
+    room = config.max_leaves - octree.n_leaves
+    split = finest[: max(0, room) // CHILDREN]
+    parts = (2 * ijk[split][:, None] + OFFSETS.astype(np.int32)).reshape(-1, 3)
+    levels, kept = np.repeat(level[split] + 1, 8), np.empty(len(parts), bool)
+    for one in np.unique(levels):
+        own, edge = np.flatnonzero(levels == one), frame.size / 2.0**one
+        thick = edge * largest_sigma(field, parts[own], frame.origin, edge, per_axis=2)
+        kept[own] = dilated(parts[own], thick > -math.log1p(-config.empty_opacity))
+    most = int(np.searchsorted(np.cumsum(kept.reshape(-1, 8).sum(1) - 1), room, side="right"))
+    kept[8 * most :] = False
+    whole = np.ones(octree.n_leaves, bool)
+    whole[split[:most]] = False
+    left = len(finest) - most
+    return np.concatenate([level[whole], levels[kept]]), np.concatenate([ijk[whole], parts[kept]]), left
 
 
 def _search(
@@ -116,7 +146,7 @@ def _search(
         kept = dilated(cells, thickness > threshold)
         finished = wanted[kept] <= level
         most -= int(finished.sum())
-        if most < 4 * (~finished).sum():  # so many cells a surface has at half their size
+        if most < CHILDREN * (~finished).sum():
             return None
         levels.append(np.full(finished.sum(), level))
         cells = cells[kept]

@@ -1,12 +1,13 @@
 """Distillation: a radiance field becomes a sparse octree of several leaf sizes, and what that costs is measured.
 
 1. Candidates: the field is looked at in coarse cells; only cells that hold something, and their neighbours, are looked
-   at again at half the size, down to the finest level (outside the inner cube: the coarser the farther out).
+   at again at half the size, down to twice the finest size (outside the inner cube: the coarser the farther out).
 2. Values: coefficient and spherical harmonics at the leaves' vertices, averaged around the vertex.
-3. Merging: eight leaves whose values the parent's own corners reproduce become one. Done before pruning, so that thin
-   haze is judged by large leaves, in which it has weight.
-4. Visibility: leaves that ENOUGH_VIEWS views have in their picture and no ray needs are removed (starts/visible.py) [after
-   PlenOctrees, section 4, which asks all views: what few views do not need is often needed by another].
+3. Visibility: leaves that ENOUGH_VIEWS views have in their picture and no ray needs are removed (starts/visible.py) [after
+   PlenOctrees, section 4, which asks all views: what few views do not need is often needed by another]. They are judged as
+   they would be merged: thin haze has weight in large leaves only.
+4. What is left is split and filled again: before, a haze of the finest leaves would fit nowhere.
+5. Merging: eight leaves whose values the parent's own corners reproduce become one.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ from nerfvol.measure.scores import evaluate, score_views
 from nerfvol.octree.merge import merge_smooth
 from nerfvol.octree.rows import DENSITY_SCALE
 from nerfvol.octree.tree import Octree
-from nerfvol.starts.cells import Frame, candidate_cells
-from nerfvol.starts.values import write_values
+from nerfvol.starts.cells import Frame, candidate_cells, finer_cells
+from nerfvol.starts.values import REACH, WIDE_REACH, write_values
 from nerfvol.starts.visible import judged_downscale, needed
 from nerfvol.views import OctreeModel
 
@@ -39,7 +40,10 @@ COMPARED_VIEWS = 2
 
 @dataclasses.dataclass
 class DistillReport:
-    """What came out and what was lost; PSNR in dB over the same views of the dataset."""
+    """What came out and what was lost; PSNR in dB over the same views of the dataset.
+
+    candidates: the most cells that were leaves at one time; pruned: of the coarse ones, not seen; merged: of the fine ones.
+    """
 
     leaves: int
     vertices: int
@@ -87,29 +91,22 @@ def distill(
         InputError: the field is empty: nothing in it is as opaque as ``empty_opacity``.
     """
     config = config.for_scene(dataset.scene)
-    messages: list[str] = []
-    frame = Frame.of(domain, cast(int, config.level))
-    level, ijk = candidate_cells(field, frame, config, messages)
-    if dataset.scene.is_unbounded:
-        kept = ~dataset.before_a_lens(frame.origin + (ijk + 0.5) * (frame.size / 2.0**level)[:, None])
-        level, ijk = level[kept], ijk[kept]
-    return_free_memory()
-    octree = Octree.from_leaves(
-        level, ijk, frame.origin.tolist(), frame.size, cast(int, config.sh_degree), DENSITY_SCALE / (2 * domain.half)
-    )
-    write_values(octree, field)
-    candidates = octree.n_leaves
-    octree = merge_smooth(octree, config.coarse_level, config.merge_tolerance)
-    merged = octree.n_leaves
-    return_free_memory()
-    keep = needed(octree, dataset, background, config.prune_weight)
-    if not keep.any():
-        raise InputError(
-            "the field holds nothing that the training views can see; train it longer or use --init direct"
+    level, messages = cast(int, config.level), []
+    coarse = dataclasses.replace(config, level=max(min(config.coarse_level, level), level - 1))
+    goal = Frame.of(domain, level)
+    frame, *cells = candidate_cells(field, goal.finer(cast(int, coarse.level) - level), coarse, messages)
+    sieve, whole = _Sieve(field, dataset, background, config), 0
+    octree = sieve.seen(sieve.octree(frame, *cells, reach=REACH if frame == goal else WIDE_REACH))
+    while frame.finest < goal.finest and not whole:
+        *cells, whole = finer_cells(field, octree, frame, config)
+        frame = frame.finer(1)
+        octree = sieve.octree(frame, *cells, reach=REACH)
+    octree = sieve.merged_octree(octree)
+    if whole:
+        messages.append(
+            f"the field is hazy: {whole:,} leaves of its thinnest parts were not split, for it would not fit into "
+            f"{config.max_leaves:,} leaves"
         )
-    if not keep.all():
-        octree, _ = octree.prune(keep)
-    return_free_memory()
     field_psnr = octree_psnr = math.nan
     if render_field is not None:
         few = dataset.evenly(COMPARED_VIEWS).smaller(judged_downscale(dataset), background)
@@ -119,7 +116,50 @@ def distill(
     report = DistillReport(
         leaves=octree.n_leaves, vertices=octree.n_vertices,
         leaves_per_level=dict(zip(levels.tolist(), counts.tolist(), strict=True)),
-        bytes=octree.values.nbytes + octree.corners.nbytes, candidates=candidates, merged=candidates - merged,
-        pruned=merged - octree.n_leaves, field_psnr=field_psnr, octree_psnr=octree_psnr, messages=messages,
+        bytes=octree.values.nbytes + octree.corners.nbytes, candidates=sieve.candidates, merged=sieve.merged,
+        pruned=sieve.pruned, field_psnr=field_psnr, octree_psnr=octree_psnr, messages=messages,
     )  # fmt: skip
     return octree, report
+
+
+class _Sieve:
+    """Makes leaves of cells and takes away what is not worth having; counts what came in and went."""
+
+    def __init__(
+        self, field: RadianceField, dataset: Dataset, background: Sequence[float], config: DistillConfig
+    ) -> None:
+        self.field, self.dataset, self.background, self.config = field, dataset, background, config
+        self.candidates = self.merged = self.pruned = 0
+
+    def octree(self, frame: Frame, level: np.ndarray, ijk: np.ndarray, reach: float) -> Octree:
+        """The octree of these cells with the field's values (write_values)."""
+        if self.dataset.scene.is_unbounded:
+            kept = ~self.dataset.before_a_lens(frame.origin + (ijk + 0.5) * (frame.size / 2.0**level)[:, None])
+            level, ijk = level[kept], ijk[kept]
+        return_free_memory()
+        scale, degree = DENSITY_SCALE / (2 * frame.half), cast(int, self.config.sh_degree)
+        octree = Octree.from_leaves(level, ijk, frame.origin.tolist(), frame.size, degree, scale)
+        write_values(octree, self.field, reach)
+        self.candidates = max(self.candidates, octree.n_leaves)
+        return octree
+
+    def merged_octree(self, octree: Octree) -> Octree:
+        """The octree with larger leaves where it is smooth."""
+        merged = merge_smooth(octree, self.config.coarse_level, self.config.merge_tolerance)
+        self.merged = octree.n_leaves - merged.n_leaves
+        return merged
+
+    def seen(self, octree: Octree) -> Octree:
+        """The octree without what no view needs, judged by the larger leaves that it would merge to; InputError where nothing
+        is left."""
+        judged = merge_smooth(octree, self.config.coarse_level, self.config.merge_tolerance)
+        keep = needed(judged, self.dataset, self.background, self.config.prune_weight)
+        if not keep.any():
+            raise InputError(
+                "the field holds nothing that the training views can see; train it longer or use --init direct"
+            )
+        if keep.all():
+            return octree
+        octree = octree.prune(keep[judged.query(octree.leaf_centers())])[0]
+        self.pruned = self.candidates - octree.n_leaves
+        return octree

@@ -44,8 +44,13 @@ def needed(octree: Octree, dataset: Dataset, background: Sequence[float], weight
 
 def solid(octree: Octree) -> np.ndarray:
     """(n_leaves,) bool: leaves as opaque as SOLID along their side, at their densest corner."""
+    return -np.expm1(-thickness(octree)) >= SOLID
+
+
+def thickness(octree: Octree) -> np.ndarray:
+    """(n_leaves,) optical thickness of each leaf along its side, at its densest corner."""
     densest = octree.density_scale * explin(octree.density[octree.corners].max(1))
-    return -np.expm1(-densest * octree.leaf_sizes()) >= SOLID
+    return densest * octree.leaf_sizes()
 
 
 def views_of_leaves(octree: Octree, dataset: Dataset) -> np.ndarray:

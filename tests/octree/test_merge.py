@@ -16,7 +16,7 @@ def test_merging_changes_nothing_where_the_field_is_trilinear() -> None:
             return 300 + 100 * positions[:, 0] - 50 * positions[:, 1]
 
     octree = full_octree(4)
-    write_values(octree, Linear(), 1)
+    write_values(octree, Linear(), 0)
     merged = merge_smooth(octree, 2, 1e-4)
     merged.validate()
     assert merged.n_leaves == 64 and (merged.leaf_level == 2).all()
@@ -27,7 +27,7 @@ def test_merging_changes_nothing_where_the_field_is_trilinear() -> None:
 
 def test_merging_keeps_within_its_tolerance() -> None:
     octree = full_octree(5)
-    write_values(octree, Blob(), 1)
+    write_values(octree, Blob(), 0)
     sizes = []
     for tolerance in (0.003, 0.03):
         merged = merge_smooth(octree, 2, tolerance)
@@ -76,7 +76,7 @@ def test_leaves_of_several_sizes_merge_with_their_values() -> None:
     """Every value that is left stands where it stood, with leaves of three sizes to begin with."""
     octree = full_octree(3)
     octree = octree.subdivide(octree.leaf_ijk[:, 0] < 2)[0]
-    write_values(octree, Blob(), 1)
+    write_values(octree, Blob(), 0)
     merged = merge_smooth(octree, 2, 0.02)
     merged.validate()
     assert len(np.unique(merged.leaf_level)) >= 3
