@@ -19,7 +19,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCES = ROOT / "nerfvol" / "kernels" / "csrc"
-UNITS = ("web.cpp", "web_octree.cpp", "web_splats.cpp", "web_inflate.cpp", "web_pool.cpp", "prefilter.cpp", "topology.cpp")
+UNITS = (
+    "web.cpp",
+    "web_octree.cpp",
+    "web_splats.cpp",
+    "web_inflate.cpp",
+    "web_pool.cpp",
+    "prefilter.cpp",
+    "topology.cpp",
+)
 OUT = ROOT / "nerfvol" / "viewer" / "kernels.wasm"
 STAMP = OUT.with_suffix(".json")
 FLAGS = (

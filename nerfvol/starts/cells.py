@@ -104,7 +104,7 @@ def candidate_cells(
 
 
 def finer_cells(
-    field: RadianceField, octree: Octree, frame: Frame, config: DistillConfig
+    field: PointField, octree: Octree, frame: Frame, config: DistillConfig
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """The leaves of ``octree``, whose finest cells are those of ``frame``, with these split: levels (n,), positions (n, 3), and
     how many stay whole because the others fill ``config.max_leaves``, the thinnest.

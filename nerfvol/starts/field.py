@@ -125,9 +125,7 @@ def distill(
 class _Sieve:
     """Makes leaves of cells and takes away what is not worth having; counts what came in and went."""
 
-    def __init__(
-        self, field: RadianceField, dataset: Dataset, background: Sequence[float], config: DistillConfig
-    ) -> None:
+    def __init__(self, field: PointField, dataset: Dataset, background: Sequence[float], config: DistillConfig) -> None:
         self.field, self.dataset, self.background, self.config = field, dataset, background, config
         self.candidates = self.merged = self.pruned = 0
 

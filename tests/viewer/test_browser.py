@@ -324,7 +324,8 @@ def test_a_served_page_jumps_to_photographs_and_follows_a_new_model(browser):
         width, height = page.evaluate("[canvas.clientWidth, canvas.clientHeight]")
         page.evaluate("(nerfvol.camera = {...nerfvol.first, fov: 2.5}, 0)")
         tip = page.evaluate(
-            "([at, w, h]) => project(nerfvol.camera, at, w, h)", [shown.dataset.cameras[2].position.tolist(), width, height]
+            "([at, w, h]) => project(nerfvol.camera, at, w, h)",
+            [shown.dataset.cameras[2].position.tolist(), width, height],
         )
         assert 0 < tip[0] < width and 0 < tip[1] < height
         assert page.evaluate(OVERLAID, tip)
