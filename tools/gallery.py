@@ -13,15 +13,15 @@ from pathlib import Path
 from data_synth.cli import main as synth
 
 ROOT = Path(__file__).resolve().parent.parent
-TRACED = "--integrator path --spp 32 --denoise --size"
+TRACED = "--integrator path --spp 16 --denoise --size"
 PICTURES = {
-    "cloud": f"cloud {TRACED} 640x480",
-    "cumulonimbus": f"cumulonimbus {TRACED} 480x480",
+    "cloud": f"cloud {TRACED} 480x360",
+    "cumulonimbus": f"cumulonimbus {TRACED} 360x360",
     "stratus": f"stratus {TRACED} 640x400",
-    "explosion": f"explosion {TRACED} 480x480",
+    "explosion": f"explosion {TRACED} 360x360",
     "phantom": f"phantom {TRACED} 480x480",
     "smoke": f"smoke {TRACED} 480x480",
-    "stent": f"phantom --volume {{volumes}}/stent.npz {TRACED} 480x480",
+    "stent": f"phantom --volume {{volumes}}/stent.npz {TRACED} 360x360",
     "real_smoke": f"smoke --volume {{volumes}}/smoke.vdb {TRACED} 480x480",
     "fog": "fog --side 3 --size 640x480",
     "mist": f"mist {TRACED} 640x480",
