@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 
-from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.export.part import Up, turn_to
 from nerfvol.models import Model
 from nerfvol.splats.ply import save_ply
 from nerfvol.splats.splats import Splats
 from nerfvol.splats.turn import turned
+from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.views import OctreeModel
 
 

@@ -52,7 +52,10 @@ def test_convert_and_export_make_the_same_splats(tmp_path, command, octree_file)
             pytest.importorskip("gsply", reason="needs gsply")
         converted, exported = tmp_path / f"c_{name}", tmp_path / f"e_{name}"
         assert command("convert", octree_file, "--to", "splats", "--out", converted)[0] == 0
-        assert command("export", octree_file, "--out", exported, "--format", "splats" if name == "s.ply" else "spz")[0] == 0
+        assert (
+            command("export", octree_file, "--out", exported, "--format", "splats" if name == "s.ply" else "spz")[0]
+            == 0
+        )
         unpack = gzip.decompress if name.endswith("spz") else bytes  # whose head has the time
         assert unpack(converted.read_bytes()) == unpack(exported.read_bytes())
     n = load_model(tmp_path / "c_s.ply").describe()["splats"]

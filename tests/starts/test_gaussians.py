@@ -6,10 +6,10 @@ import pytest
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.errors import InputError
 from nerfvol.export import export_model
-from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.octree.points import leaf_density
 from nerfvol.rotations import rotations
 from nerfvol.splats.turn import turned
+from nerfvol.starts.gaussians import splats_of_leaves
 from nerfvol.views import OctreeModel, SplatModel
 from tests.export.rasteriser import harmonics, rasterise
 from tests.export.shapes import BLUE, CENTER, RED, ball, box

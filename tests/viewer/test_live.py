@@ -55,7 +55,7 @@ def test_pausing_is_no_training_time(tiny_scene, tmp_path):
 
     live = Pausing(shown, every=1e9)
     train.train(runs.settings(tiny_scene, tmp_path / "run"), watch=live, say=lambda sentence: None)
-    (counted, passed), = stood
+    ((counted, passed),) = stood
     assert passed >= pause and passed - counted >= pause - 0.05  # a step's edition counts, standing still does not
     shown.pause(True)
     shown.wait_while_paused(lambda: True)  # Ctrl-C ends a pause
