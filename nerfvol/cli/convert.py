@@ -48,7 +48,7 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--time-budget", metavar="TIME", help="train the result on the images for so long, such as 25s "
                    "(default: not at all)")  # fmt: skip
     p.add_argument("--level", metavar="L", help="octree: finest leaves, 2^L along the scene (default: 1.4 pixels wide)")
-    p.add_argument("--max-splats", metavar="N", help="splats: at most so many: the finest level of the octree that has no more, "
+    p.add_argument("--max-splats", metavar="N", help="splats: at most so many: the octree's finest level that has no more, "
                    "or, where they are trained, discs on what is seen (default: all visible leaves; 100000 discs)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B (default: that of the training)")
     p.add_argument(

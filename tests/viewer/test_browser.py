@@ -323,10 +323,10 @@ def test_a_served_page_jumps_to_photographs_and_follows_a_new_model(browser):
         # a click on another camera's place in the picture chooses it
         width, height = page.evaluate("[canvas.clientWidth, canvas.clientHeight]")
         page.evaluate("(nerfvol.camera = {...nerfvol.first, fov: 2.5}, 0)")
-        tip = page.evaluate(
-            "([at, w, h]) => project(nerfvol.camera, at, w, h)",
-            [shown.dataset.cameras[2].position.tolist(), width, height],
-        )
+        seen = camera(page)
+        right, up, back = axes(seen) @ (shown.dataset.cameras[2].position - seen["position"])
+        focal = 0.5 * min(width, height) / math.tan(seen["fov"] / 2)
+        tip = [width / 2 - focal * right / back, height / 2 + focal * up / back]
         assert 0 < tip[0] < width and 0 < tip[1] < height
         assert page.evaluate(OVERLAID, tip)
         page.evaluate("(document.getElementById('panel').hidden = true, 0)")

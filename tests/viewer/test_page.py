@@ -169,8 +169,8 @@ def test_compact_splats_are_as_near_as_their_steps(tmp_path):
     assert np.abs(back.logits - np.clip(splats.logits[match], -12, 12)).max() <= 0.5 / 16 + 1e-6
     turn = np.einsum("nij,nkj->nik", rotations(back.quats), rotations(splats.quats[match]))
     angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1))
-    # The rotation vector's error bounds the angle: half a step along three axes, or a whole one where the nearest vector is longer
-    # than half a turn and is rounded towards none. 1e-4: float32 in the trace (7e-7) over 2 sin(angle).
+    # The rotation vector's error bounds the angle: half a step along three axes, or a whole one where the nearest vector is
+    # longer than half a turn and is rounded towards none. 1e-4: float32 in the trace (7e-7) over 2 sin(angle).
     step = 1 / 96
     nearest = np.rint(rotation_vectors(splats.quats[match]) / step) * step
     beyond = np.linalg.norm(nearest, axis=1) > np.pi
