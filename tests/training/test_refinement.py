@@ -55,7 +55,7 @@ def test_planted_errors_are_won_back_and_exact_poses_stay(scenes, tmp_path):
              for name, path in refined.items()}  # fmt: skip
     # Exact poses wander by a fraction of a pixel along what hardly shows, and their score, after the fit, loses nothing.
     assert np.median(moves["exact"]) < 1 / 3 < 0.4 < np.median(moves["off"])
-    rows = list(csv.DictReader((refined["off"] / "photographs.csv").open()))
+    rows = list(csv.DictReader((refined["off"] / "photographs.csv").read_text().splitlines()))
     assert all(float(row["pose_moved_pixels"]) >= 0 for row in rows)
     page = (refined["off"] / "photographs.html").read_text()
     assert page.count("<figure>") == len(rows) and "http" not in page and page.index(rows[0]["photograph"]) > 0
