@@ -4,8 +4,8 @@
 >>> scene = ds.scenes.cloud(resolution=64)
 >>> picture = ds.render(scene, scene.viewpoints.camera(30, 20, 64, 64), integrator=ds.Path(spp=4))
 
-docs/data_synth.md has a snippet for each of the names below. They are loaded when they are asked for: whoever only writes the file
-of a volume does not need what compiles scenes (numba, the extra ``nerfvol[synth]``).
+docs/data_synth.md has a snippet for each of the names below. They are loaded when they are asked for: who writes a volume
+does not need what compiles scenes (numba, the extra ``nerfvol[synth]``).
 """
 
 from __future__ import annotations

@@ -37,6 +37,7 @@ class Mutant:
 
 M = Mutant
 PEOPLE, MASKS, FAULTS = "datasets/test_whatever_people_bring.py", "datasets/test_masks.py", "training/test_faults.py"
+PROGRAMS = "datasets/test_other_programs.py"
 MUTANTS = (
     # ---------------------------------------------------------------- cameras
     M("nerfvol/cameras/camera.py", "np.arange(width) + 0.5\n        band", "np.arange(width)\n        band", "cameras", "rays through pixels' corners"),
@@ -49,7 +50,7 @@ MUTANTS = (
     # ---------------------------------------------------------------- datasets
     M("nerfvol/datasets/listing.py", "if scale != 1:", "if False:", PEOPLE, "scaled axes are taken in silence"),
     M("nerfvol/datasets/listing.py", "self.lost.append(listed)\n", "", PEOPLE, "lost poses are passed over in silence"),
-    M("nerfvol/datasets/listing.py", 'not path.name.startswith((".", "dynamic_mask_"))', 'not path.name.startswith("dynamic_mask_")', PEOPLE, "files of operating systems are photographs"),
+    M("nerfvol/datasets/listing.py", 'and not path.name.startswith(".") and not is_mask', "and not is_mask", PEOPLE, "files of operating systems are photographs"),
     M("nerfvol/datasets/listing.py", "MaskFile(mask, black_is_out=False)", "MaskFile(mask)", MASKS, "the convention of dynamic masks"),
     M("nerfvol/datasets/frames.py", "parts.append(pixels if mask.black_is_out else 255 - pixels)", "parts.append(255 - pixels if mask.black_is_out else pixels)", MASKS, "masks the other way round"),
     M("nerfvol/datasets/frames.py", "found |= {id(view) for", "found |= {None for", PEOPLE, "cameras astray stay in"),
@@ -68,6 +69,37 @@ MUTANTS = (
     M("nerfvol/datasets/photographs.py", "np.minimum(mask, own)[..., None]", "np.full_like(mask, 255)[..., None]", MASKS, "splats learn what is masked"),
     M("nerfvol/datasets/frame.py", "octree.size * self.scale, octree.density_scale / self.scale", "octree.size * self.scale, octree.density_scale", FAULTS, "densities in another unit"),
     M("nerfvol/datasets/fingerprint.py", 'said.append(f"{len(gone)} are gone ({named(gone)})")', "pass", FAULTS, "missing pictures are not missed"),
+    # ---------------------------------------------------------------- what other programs write
+    M("nerfvol/datasets/listing.py", 'return unicodedata.normalize("NFC", name).lower()', "return name.lower()", PROGRAMS, "names of macOS are other names"),
+    M("nerfvol/datasets/listing.py", 'address = unquote(re.sub("^file://", "", listed))', "address = listed", PROGRAMS, "addresses are names"),
+    M("nerfvol/datasets/listing.py", "if absolute else range(len(parts) - 1, len(parts)):", "if absolute else ():", PROGRAMS, "pictures next to the json"),
+    M("nerfvol/datasets/listing.py", 'for name in ("masks", "mask"))', 'for name in ("masks",))', PROGRAMS, "masks in a folder called mask"),
+    M("nerfvol/datasets/listing.py", 'f"{path.name}.mask", f"{path.stem}.mask", f"{path.stem}_mask"', 'f"{path.name}.mask", f"{path.stem}.mask", f"{path.stem}.mask"', PROGRAMS, "Metashape's masks"),
+    M("nerfvol/datasets/listing.py", "if folder not in self._in_use and not with_mask and frames]", "if False]", PROGRAMS, "masks that fit no image are passed over in silence"),
+    M("nerfvol/datasets/transforms.py", "or by_end.get(name) or name\n", "or name\n", PROGRAMS, "lists of bare names"),
+    M("nerfvol/datasets/transforms.py", "if f.path in trained)):", "if f.path is trained)):", PROGRAMS, "pictures in two splits"),
+    M("nerfvol/datasets/frames.py", "return header.orientation <= 4 or width == height or not", "return width == height or not", PROGRAMS, "orientations that nothing settles"),
+    M("nerfvol/datasets/frames.py", "stated = calibration.width is not None and calibration.height is not None\n    return", "stated = False\n    return", PROGRAMS, "orientations that the size settles"),
+    M("nerfvol/datasets/kinds.py", "if (apart <= 1e-9).all():", "if False:", PROGRAMS, "poses that are all the same"),
+    M("nerfvol/datasets/llff.py", "depths = rows[(rows[:, 15] > 0) & (rows", "depths = rows[(rows", PROGRAMS, "depths behind the camera"),
+    M("nerfvol/datasets/llff.py", "rows[np.ix_(lost, [4, 9, 14])] = rows[stated.argmax(), [4, 9, 14]]", "pass", PROGRAMS, "one row of NaN refuses the set"),
+    M("nerfvol/datasets/nsvf.py", "if len(bare) > MOST_LOST * len(images):", "if False:", PROGRAMS, "a set without poses trains"),
+    M("nerfvol/datasets/nsvf.py", "return np.array(rows[0]).reshape(4 if len(rows[0]) == 16 else 3, -1)", "return np.array(rows[0]).reshape(4 if len(rows[0]) == 16 else 3, -1).T", PROGRAMS, "a flat matrix by columns"),
+    M("nerfvol/datasets/colmap.py", "homes = (folder, folder.parent, folder.parent.parent) if", "homes = (folder,) if", PROGRAMS, "photographs above the model"),
+    M("nerfvol/datasets/colmap.py", "if count > 1]:", "if count > 2]:", PROGRAMS, "an image twice"),
+    M("nerfvol/datasets/colmap_files.py", "if name.endswith(\"*\") and value]:", "if name.endswith(\"*\") and value > 1]:", PROGRAMS, "terms that the lens lacks"),
+    M("nerfvol/datasets/colmap_files.py", '"SIMPLE_FISHEYE": (14, Fisheye', '"SIMPLE_FISHEYE": (14, BrownConrady', PROGRAMS, "a fisheye that is a pinhole"),
+    M("nerfvol/cameras/calibration.py", "_WIDEST = 2 * math.tan(math.radians(80))", "_WIDEST = 2 * math.tan(math.radians(89))", PROGRAMS, "focal lengths in millimetres"),
+    M("nerfvol/datasets/formats.py", "for place in (path.parent, *sorted(below)) if", "for place in sorted(below) if", PROGRAMS, "the set above the folder"),
+    # ---------------------------------------------------------------- damaged pictures
+    M("nerfvol/datasets/frames.py", "if wrong and (len(wrong) > max(1, FEW * n) or n < 10):", "if wrong and len(wrong) > max(1, FEW * n):", "datasets/test_transforms.py", "of few pictures a damaged one is left out"),
+    M("nerfvol/datasets/frames.py", "if wrong and (len(wrong) > max(1, FEW * n) or n < 10):", "if wrong and (len(wrong) > n // 2 or n < 10):", "datasets/test_transforms.py", "half of the pictures may be damaged"),
+    M("nerfvol/datasets/frames.py", "        messages.append(unread_sentence(list(unread.values())))\n", "        pass\n", "datasets/test_transforms.py", "damaged pictures are left out in silence"),
+    M("nerfvol/datasets/load.py", "        messages.append(unread_sentence(wrong))\n", "        pass\n", "datasets/test_transforms.py", "truncated pictures are left out in silence"),
+    # ---------------------------------------------------------------- extras
+    M("nerfvol/octree/plenoctree.py", "values = eval_basis(degree, directions)", "import torch; values = eval_basis(degree, torch.from_numpy(directions)).numpy()", "test_without_torch.py", "PlenOctrees need torch"),
+    M("nerfvol/starts/values.py", "held = min(dim, sh.shape[-1])", "held = dim", "starts/test_field.py", "fields of a lower degree"),
+    M("nerfvol/starts/values.py", "projector = (weights[:, None] * spherical.eval_basis(degree, dirs))", "projector = (weights[:, None] * spherical.eval_basis(degree, -dirs))", "starts/test_field.py", "view dependence from behind"),
     # ---------------------------------------------------------------- files, settings, terminals
     M("nerfvol/files/atomic.py", "Path(os.path.realpath(named)) if named.is_symlink() else named", "named", "files/test_atomic.py", "a link is replaced"),
     M("nerfvol/files/atomic.py", "    if is_special(path):\n", "    if False:\n", "files/test_atomic.py", "a pipe is replaced"),
@@ -81,7 +113,7 @@ MUTANTS = (
     M("nerfvol/training/session.py", '("SIGINT", "SIGTERM", "SIGHUP")', '("SIGINT",)', FAULTS, "kill loses a run"),
     # ---------------------------------------------------------------- mathematics
     M("nerfvol/measure/metrics.py", "mse = float(np.mean(error * error, dtype=np.float64))", "mse = float(np.mean(np.abs(error), dtype=np.float64))", "measure/test_metrics.py", "PSNR of the absolute error"),
-    M("nerfvol/measure/scores.py", "psnr(image[seen], truth[seen])", "psnr(image, truth)", MASKS, "masked pixels are scored"),
+    M("nerfvol/measure/scores.py", "psnr(of[seen], truth[seen])", "psnr(of, truth)", MASKS, "masked pixels are scored"),
     M("nerfvol/region.py", "np.ceil(np.log2(np.maximum(distance, 1)))", "np.floor(np.log2(np.maximum(distance, 1)))", "octree test_views.py starts", "levels of the background shells"),
     M("nerfvol/views.py", "pose[:3, 3] = (pose[:3, 3] - middle) / scale", "pose[:3, 3] = pose[:3, 3] / scale", FAULTS, "cameras far from the origin"),
     # ---------------------------------------------------------------- kernels
