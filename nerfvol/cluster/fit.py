@@ -150,7 +150,7 @@ def welcome(client: Client, needs: Needs) -> tuple[str, list[str]]:
 
 def _strangers(client: Client) -> dict[str, str]:
     """Workers on which this package, or one like it, is not installed, with the reason."""
-    answers = client.run(description, on_error="return")
+    answers = cast("dict[str, Any]", client.run(description, on_error="return"))
     return {
         address: f"nerfvol cannot be used there ({type(answer).__name__}: {answer})"
         for address, answer in answers.items()

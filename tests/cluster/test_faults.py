@@ -175,27 +175,6 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
     assert contents(tmp_path / "out") == expected
 
 
-def test_a_worker_without_this_package_is_named(tmp_path):
-    with engine(tmp_path) as (file, worker), connect(file) as found:
-        worker(PYTHONPATH=str(hidden(tmp_path)))
-        found.wait_for_workers(1, timeout=60)
-        with pytest.raises(InputError, match=r"is fit after 3 s \(tcp://.*: nerfvol cannot be used there \(Module"):
-            fit.welcome(found, Needs(patience=3.0))
-        worker()
-        found.wait_for_workers(2, timeout=60)
-        started = time.monotonic()
-        resource, messages = fit.welcome(found, Needs())
-        assert len(messages) == 1 and "cannot be used there" in messages[0] and time.monotonic() - started < 50
-        assert len(fit.fit_workers(found, resource)) == 1
-
-
-def hidden(folder: Path) -> Path:
-    """A folder that, on the path of modules, hides nerfvol."""
-    (folder / "hidden").mkdir()
-    (folder / "hidden" / "sitecustomize.py").write_text('import sys\nsys.modules["nerfvol"] = None\n')
-    return folder / "hidden"
-
-
 def test_a_worker_that_joins_late_works_too(tmp_path):
     with engine(tmp_path) as (file, worker), connect(file) as found:
         worker()
