@@ -48,7 +48,7 @@ class Calibration:
         fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)  # square pixels where only one is given
         if fx is None or fy is None:
             raise InputError("the focal length is missing: expected fl_x (pixels) or camera_angle_x (radians)")
-        if isinstance(self.lens, BrownConrady) and max(width / fx, height / fy) > _WIDEST and min(fx, fy) > 0:
+        if isinstance(self.lens, BrownConrady) and min(fx, fy) > 0 and max(width / fx, height / fy) > _WIDEST:
             degrees = math.degrees(2 * math.atan(0.5 * max(width / fx, height / fy)))
             raise InputError(
                 f"a focal length of {min(fx, fy):g} pixels in a picture of {width}x{height} is a field of view of "

@@ -187,7 +187,7 @@ def edit(path, change):
     ("images.bin", lambda d: d[:68] + struct.pack("<i", 99) + d[72:], "camera 99 is not in the model"),
     ("images.bin", lambda d: struct.pack("<Q", 0), "holds no images"),
     ("cameras.bin", lambda d: d[:20], "truncated"),
-    ("cameras.bin", lambda d: d[:12] + struct.pack("<i", 7) + d[16:], "lens model 7 is not supported"),
+    ("cameras.bin", lambda d: d[:12] + struct.pack("<i", 7) + d[16:], "lens model FOV is not supported"),
     ("cameras.bin", lambda d: d[:32] + struct.pack("<d", np.inf) + d[40:], "finite parameters"),
     ("cameras.bin", lambda d: d[:32] + struct.pack("<d", -1.0) + d[40:], "focal lengths must be positive"),
     ("cameras.bin", lambda d: d[:16] + struct.pack("<Q", 0) + d[24:], "finite parameters"),
@@ -216,7 +216,7 @@ def test_rational_distortion_is_refused(tmp_path):
     cameras = [Camera(LENSES["FULL_OPENCV"], c.c2w) for c in scenes.ring()]
     scenes.write_colmap(tmp_path, cameras, scenes.random_images(), model="FULL_OPENCV")
     edit(tmp_path / "sparse/0/cameras.bin", lambda d: d[: 32 + 9 * 8] + struct.pack("<d", 0.1) + d[32 + 10 * 8 :])
-    with pytest.raises(InputError, match="rational terms"):
+    with pytest.raises(InputError, match="the term k4 of FULL_OPENCV is not supported unless it is zero"):
         load_dataset(tmp_path)
 
 

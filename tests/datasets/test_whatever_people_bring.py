@@ -264,7 +264,8 @@ def test_photographs_are_turned_where_their_calibration_is_for_upright_ones(tmp_
     dataset = load_dataset(folder)
     turns = orientation >= 5
     np.testing.assert_array_equal(dataset.images[0], upright if turns else stored)
-    assert any("EXIF orientation" in message for message in dataset.messages) == turns
+    assert any("are turned as their EXIF orientation" in message for message in dataset.messages) == turns
+    assert any("are taken as stored" in message for message in dataset.messages) == (1 < orientation < 5)
 
 
 # ------------------------------------------------------------------ lists and files
