@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def eval_basis(degree: int, dirs: Values) -> Values:
     if degree >= 1:
         values += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree < 2:
-        return library.stack(values, -1)
+        return cast("Values", library.stack(values, -1))
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     values += [_C2[0] * xy, -_C2[0] * yz, _C2[1] * (2 * zz - xx - yy), -_C2[0] * xz, _C2[2] * (xx - yy)]
     if degree >= 3:
@@ -89,7 +89,7 @@ def eval_basis(degree: int, dirs: Values) -> Values:
             -_C4[1] * xz * (xx - 3 * yy),
             _C4[6] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
-    return library.stack(values, -1)
+    return cast("Values", library.stack(values, -1))
 
 
 def eval_colour(sh: Values, dirs: Values) -> Values:
@@ -108,4 +108,4 @@ def eval_colour(sh: Values, dirs: Values) -> Values:
     degree = math.isqrt(sh.shape[-1]) - 1
     if sh.ndim < 2 or sh.shape[-2] != 3 or (degree + 1) ** 2 != sh.shape[-1]:
         raise ValueError(f"sh must have shape (..., 3, (degree + 1)**2), got {tuple(sh.shape)}")
-    return 0.5 + (sh * eval_basis(degree, dirs)[..., None, :]).sum(-1)
+    return cast("Values", 0.5 + (sh * eval_basis(degree, dirs)[..., None, :]).sum(-1))

@@ -58,7 +58,9 @@ def room() -> SplatModel:
     colours = np.random.default_rng(0).uniform(0.08, 0.8, (which.max() + 1, 3))[which.ravel()]
     scales = np.tile([0.55 * SPACING, 0.55 * SPACING, 1e-3], (len(places), 1))
     sh = ((colours - 0.5) / Y0)[:, :, None]
-    splats = Splats(places, np.log(scales), turning_z_to(normals), np.full(len(places), 4.0), sh, np.zeros(3), "mip")
+    logits, quats = np.full(len(places), 4.0), turning_z_to(normals)
+    places, scales, quats, logits, sh = (part.astype(np.float32) for part in (places, scales, quats, logits, sh))
+    splats = Splats(places, np.log(scales), quats, logits, sh, np.zeros(3), "mip")
     return SplatModel(splats, {"near": 0.05})
 
 

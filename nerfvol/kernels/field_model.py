@@ -74,4 +74,6 @@ class CompiledField:
         if self.has_sh:
             sigma, sh = self.sh(positions)
             return sigma, eval_colour(sh, viewdirs)
-        return field_ops.evaluate(self.state, positions, np.ascontiguousarray(viewdirs), self.march)
+        sigma, colour = field_ops.evaluate(self.state, positions, np.ascontiguousarray(viewdirs), self.march)
+        assert colour is not None  # directions were given
+        return sigma, colour

@@ -133,7 +133,7 @@ def _filled(
             within = ((cells >= 0) & (cells < (1 << levels[part])[:, None, None])).all(2)
             keys = morton(np.where(within[..., None], cells, 0).reshape(-1, 3)).reshape(within.shape)
             keys = np.sort(np.where(within, keys, -1), axis=1)
-            new = keys >= 0
+            new = np.asarray(keys >= 0)
             new[:, 1:] &= keys[:, 1:] != keys[:, :-1]
             rows, _ = np.nonzero(new)
             numbers.append(part[rows])
