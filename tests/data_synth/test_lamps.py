@@ -116,11 +116,12 @@ def test_lamps_throw_shadows():
     """A lamp keeps the sun from what looks into its face, and with a black back from what looks at that as well."""
 
     def scene(shines, back):
-        edges = [(0, 40, 0), (40, 0, 0)] if shines == "down" else [(40, 0, 0), (0, 40, 0)]
+        # As wide as to shade the floor wherever a scattered path may come to it.
+        edges = [(0, 4e4, 0), (4e4, 0, 0)] if shines == "down" else [(4e4, 0, 0), (0, 4e4, 0)]
         return Scene(
             medium=media.grid(np.ones((9, 9, 9)), (-1, -1, -0.9), (1, 1, 0.9), (0.3, 0.5, 0.8), (0.9, 0.6, 0.3)),
             shapes=[surfaces.plane(0, (0, 0, -1), (0, 0, 1))], materials=[materials.lambert(0.5)],
-            lights=[lights.directional((0, 0, 1), 2.0), lights.quad((-20, -20, 1.5), *edges, 0.0, back)],
+            lights=[lights.directional((0, 0, 1), 2.0), lights.quad((-2e4, -2e4, 1.5), *edges, 0.0, back)],
         )  # fmt: skip
 
     c = camera((0.1, -3.0, 0.2), (0, -1.0, -1.0))

@@ -145,9 +145,9 @@ class Wrapped(Blob):
         super().__init__()
         self.haze, self.rim = haze, rim
 
-    def density(self, positions: torch.Tensor) -> torch.Tensor:
-        distance = (positions - CENTER.to(positions.dtype)).norm(dim=-1)
-        return self.haze + 60 * torch.sigmoid((0.3 - distance) / self.rim)
+    def density(self, positions: np.ndarray) -> np.ndarray:
+        distance = np.linalg.norm(positions - CENTER, axis=-1)
+        return self.haze + 60 / (1 + np.exp(np.minimum((distance - 0.3) / self.rim, 80.0)))
 
 
 def test_haze_that_no_view_needs_costs_no_detail() -> None:
@@ -158,7 +158,7 @@ def test_haze_that_no_view_needs_costs_no_detail() -> None:
     assert frame.finest == 4 and len(ijk) == 16**3  # all of the cube, which at the finest size would be 32**3
     octree, report = distill(Wrapped(), DOMAIN, black_views(2 * ENOUGH_VIEWS), (1, 1, 1), config)
     assert not report.messages and report.candidates <= config.max_leaves and report.pruned > 2_000
-    distance = np.abs(np.linalg.norm(octree.leaf_centers() - CENTER.numpy(), axis=1) - 0.3)
+    distance = np.abs(np.linalg.norm(octree.leaf_centers() - CENTER, axis=1) - 0.3)
     assert (distance < 0.03).sum() > 200 and (octree.leaf_level[distance < 0.03] == 5).all()
 
 
@@ -168,7 +168,7 @@ def test_of_few_views_haze_what_does_not_fit_is_split_last() -> None:
     octree, report = distill(Wrapped(), DOMAIN, black_views(3), (1, 1, 1), config)
     assert report.pruned == report.merged == 0 and 11_000 < octree.n_leaves <= config.max_leaves
     assert (octree.leaf_sizes() ** 3).sum() == pytest.approx(8)  # the haze is there, in leaves of two sizes
-    distance = np.abs(np.linalg.norm(octree.leaf_centers() - CENTER.numpy(), axis=1) - 0.3)
+    distance = np.abs(np.linalg.norm(octree.leaf_centers() - CENTER, axis=1) - 0.3)
     assert (octree.leaf_level[distance < 0.03] == 5).all()
     assert len(report.messages) == 1
     assert f"{(octree.leaf_level == 4).sum():,} leaves of its thinnest parts were not split" in report.messages[0]
@@ -178,8 +178,8 @@ def test_parts_that_hold_nothing_are_no_leaves() -> None:
     """Of the leaves that are split those parts stay that hold something or touch one that does, as of all cells."""
 
     class Wall(Blob):
-        def density(self, positions: torch.Tensor) -> torch.Tensor:
-            return torch.where((positions[:, 0] - CENTER[0]).abs() < 1 / 16, 5.0, 0.0)
+        def density(self, positions: np.ndarray) -> np.ndarray:
+            return np.where(np.abs(positions[:, 0] - CENTER[0]) < 1 / 16, 5.0, 0.0)
 
     level, ijk, left = finer_cells(Wall(), full_octree(4), Frame.of(DOMAIN, 4), DistillConfig(level=5))
     assert left == 0 and (level == 5).all()

@@ -187,7 +187,7 @@ def test_what_holds_the_error_is_split():
 def test_rates_fade_and_the_loss_knows_the_scene(monkeypatch):
     calls = []
 
-    def record(state, view, image, options, rates):
+    def record(state, view, image, options, rates, motion=None):
         calls.append((view, options, rates))
         return splat_ops.SplatReport(0.0, 0.25, 1, 1, 8)
 
