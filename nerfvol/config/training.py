@@ -450,11 +450,12 @@ class Config(Checked):
 
     def for_views(self, n: int, scene: SceneBounds) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
-        few views show a field leaves less open than low density does (docs/experiments.md)."""
+        few views show a field leaves less open than low density does (docs/experiments.md), and smoothness whatever the start."""
         few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
-        if not few or self.init not in ("auto", "mlp"):
+        if not few:
             return self
-        return dataclasses.replace(self, init="mlp", octree=filled(self.octree, FEW_VIEWS))
+        init = "mlp" if self.init == "auto" else self.init
+        return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS))
 
     def for_pictures(self, side: int) -> Config:
         """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""

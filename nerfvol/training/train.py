@@ -58,6 +58,8 @@ WHY = {
 MakeBar = Callable[[str, float], Any]
 """A phase's name and what is done of it, 0 to 1 -> a bar with tqdm's ``update`` and ``set_postfix_str``."""
 FEWEST_SCORED = 2
+MEASURED_FROM = 1.0
+"""Seconds for each photograph from which on exposures are measured before training: that takes 0.02 to 0.08 s of each."""
 LOG_EVERY = 50
 """Steps between two lines of the log."""
 
@@ -184,7 +186,9 @@ def appearance_of(run: Run, photographs: Photographs | None = None) -> Appearanc
     mapped = dataset.scene.is_unbounded or keeps_alpha
     appearance = Appearance(len(dataset), config.appearance if mapped else "off")
     if appearance.mode != "off" and run.phase != config.representation:  # else the checkpoint knows
-        appearance.begin(measure_exposures(dataset, photographs))
+        left = run.seconds_left()
+        if appearance.mode == "on" or left is None or left >= MEASURED_FROM * len(dataset):
+            appearance.begin(measure_exposures(dataset, photographs))
     return appearance
 
 

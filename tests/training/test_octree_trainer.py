@@ -1,5 +1,6 @@
 """Coarse to fine: when leaves go and when they are split."""
 
+import copy
 import dataclasses
 import weakref
 
@@ -328,7 +329,7 @@ def test_few_views_do_not_judge_what_is_solid_in_a_given_octree(tiny_scene, sphe
     dataset = dataclasses.replace(dataset, cameras=[dataset.cameras[i] for i in numbers], names=[str(i) for i in range(views)],
                                   images=[dataset.images[i] for i in numbers])  # fmt: skip
     config = OctreeConfig(levels=[5], downscales=[1], stage_ends=[1.0], tiles=[16], prunes=[1], prune_steps=1)
-    trainer = OctreeTrainer(dataset, (1, 1, 1), config, 0, sphere_octree)
+    trainer = OctreeTrainer(dataset, (1, 1, 1), config, 0, copy.deepcopy(sphere_octree))
     trainer.step(0.0)
     octree = trainer.octree
     side, third = octree.leaf_sizes()[0], np.arange(octree.n_leaves) % 3 == 0

@@ -280,7 +280,7 @@ def test_which_representation_suits(alpha, init, expected):
 
 @pytest.mark.parametrize("views, alpha, given, start, tv", [
     (16, True, {}, "mlp", 3e-4), (17, True, {}, "auto", 6e-5), (16, False, {}, "auto", None),
-    (8, True, {"init": "direct"}, "direct", 6e-5), (8, True, {"init": "mlp"}, "mlp", 3e-4),
+    (8, True, {"init": "direct"}, "direct", 3e-4), (8, True, {"init": "mlp"}, "mlp", 3e-4),
     (8, True, {"representation": "splats"}, "auto", 6e-5), (8, True, {"representation": "field"}, "auto", 6e-5),
     (8, True, {"octree": OctreeConfig(tv_sh=0.5)}, "mlp", None),
 ])  # fmt: skip
