@@ -450,7 +450,7 @@ class Config(Checked):
 
     def for_views(self, n: int, scene: SceneBounds) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
-        few views show a field leaves less open than low density does (docs/experiments.md), and smoothness whatever the start."""
+        few views show a field leaves less open than low density does (docs/experiments.md); smoothness in any case."""
         few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
         if not few:
             return self
