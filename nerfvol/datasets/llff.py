@@ -111,7 +111,7 @@ def _load_rows(path: Path) -> NDArray[np.float64]:
     rows, stated = rows.copy(), np.isfinite(rows[:, [4, 9, 14]]).all(axis=1)
     lost = ~stated & ~np.isfinite(rows[:, :15]).any(axis=1)
     if stated.any():  # a view without a pose is left out later, whatever its lens
-        rows[np.ix_(lost, [4, 9, 14])] = rows[stated.argmax(), [4, 9, 14]]
+        rows[np.ix_(lost, np.array([4, 9, 14]))] = rows[stated.argmax(), [4, 9, 14]]
     if not np.isfinite(rows[:, [4, 9, 14]]).all():
         raise InputError(f"{path}: expected finite sizes and focal lengths, got NaN or infinity")
     return rows.astype(np.float64)

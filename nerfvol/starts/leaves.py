@@ -130,7 +130,8 @@ def _filled(
             own = lattice * half[part, None]
             points = g.means[part, None] + own @ g.axes[part].transpose(0, 2, 1)
             cells = np.floor((points - origin) / side[part, None, None]).astype(np.int64)
-            within = ((cells >= 0) & (cells < (1 << levels[part])[:, None, None])).all(2)
+            inside = np.asarray((cells >= 0) & (cells < (1 << levels[part])[:, None, None]))
+            within = np.asarray(inside.all(2))
             keys = morton(np.where(within[..., None], cells, 0).reshape(-1, 3)).reshape(within.shape)
             keys = np.sort(np.where(within, keys, -1), axis=1)
             new = np.asarray(keys >= 0)
