@@ -82,7 +82,7 @@ MUTANTS = (
     M("nerfvol/datasets/frames.py", "stated = calibration.width is not None and calibration.height is not None\n    return", "stated = False\n    return", PROGRAMS, "orientations that the size settles"),
     M("nerfvol/datasets/kinds.py", "if (apart <= 1e-9).all():", "if False:", PROGRAMS, "poses that are all the same"),
     M("nerfvol/datasets/llff.py", "depths = rows[(rows[:, 15] > 0) & (rows", "depths = rows[(rows", PROGRAMS, "depths behind the camera"),
-    M("nerfvol/datasets/llff.py", "rows[np.ix_(lost, [4, 9, 14])] = rows[stated.argmax(), [4, 9, 14]]", "pass", PROGRAMS, "one row of NaN refuses the set"),
+    M("nerfvol/datasets/llff.py", "rows[np.ix_(lost, np.array([4, 9, 14]))] = rows[stated.argmax(), [4, 9, 14]]", "pass", PROGRAMS, "one row of NaN refuses the set"),
     M("nerfvol/datasets/nsvf.py", "if len(bare) > MOST_LOST * len(images):", "if False:", PROGRAMS, "a set without poses trains"),
     M("nerfvol/datasets/nsvf.py", "return np.array(rows[0]).reshape(4 if len(rows[0]) == 16 else 3, -1)", "return np.array(rows[0]).reshape(4 if len(rows[0]) == 16 else 3, -1).T", PROGRAMS, "a flat matrix by columns"),
     M("nerfvol/datasets/colmap.py", "homes = (folder, folder.parent, folder.parent.parent) if", "homes = (folder,) if", PROGRAMS, "photographs above the model"),

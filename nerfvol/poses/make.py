@@ -149,6 +149,7 @@ def gather(
     else:
         paths = sources.find_photographs(path)
         photographs, bad = sources.copy_photographs(paths, images, settings.size)
+        bad += sources.left_out(paths)
         some = (
             [photographs[i] for i in np.unique(np.linspace(0, len(photographs) - 1, 16).round().astype(int))]
             if photographs

@@ -100,6 +100,15 @@ def find_photographs(folder: Path) -> list[Path]:
     raise InputError(f"{folder}: expected three photographs or more (JPEG, PNG, WebP, TIFF), but it holds {what}")
 
 
+def left_out(found: list[Path]) -> list[str]:
+    """A sentence on the HEIC pictures beside the photographs ``found``, where pillow-heif is not there to read them."""
+    beside = found[0].parent.iterdir() if found else ()
+    heif = [path for path in beside if path.suffix.lower() in HEIF_SUFFIXES and path not in found]
+    if not heif:
+        return []
+    return [f"{len(heif)} HEIC pictures are left out: they need pillow-heif (pip install 'nerfvol[heic]')"]
+
+
 def copy_photographs(paths: list[Path], folder: Path, size: int) -> tuple[list[Photograph], list[str]]:
     """Upright copies, at most ``size`` pixels along the longer side, in ``folder``; those that are there are kept.
 

@@ -95,6 +95,16 @@ def test_what_is_no_folder_of_photographs(tmp_path, monkeypatch, files, sentence
         find_photographs(tmp_path)
 
 
+def test_heic_pictures_beside_others_are_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "reads_heif", lambda: False)
+    for name in ("a.jpg", "b.jpg", "c.jpg", "d.HEIC"):
+        (tmp_path / name).touch()
+    found = sources.find_photographs(tmp_path)
+    assert len(found) == 3 and sources.left_out(found)[0].startswith("1 HEIC pictures are left out")
+    (tmp_path / "d.HEIC").unlink()
+    assert sources.left_out(found) == []
+
+
 def test_heic_pictures_are_read_where_pillow_heif_is(tmp_path):
     """As a phone writes them: turned by EXIF, which the copy is not any more."""
     pytest.importorskip("pillow_heif", reason="needs pillow-heif")
