@@ -18,7 +18,7 @@ from nerfvol.cameras.paths import cameras_document
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 from nerfvol.files import pictures
-from nerfvol.files.atomic import read_json, write_bytes, write_json
+from nerfvol.files.atomic import read_json, remove_leftovers, write_bytes, write_json
 from nerfvol.kernels.state import OUTPUTS
 from nerfvol.models import Model
 from nerfvol.views import depth_range, surface_depth, unit_normal
@@ -201,6 +201,7 @@ def write_pictures(
     """
     if suffix == "exr" and film.compare is not None:
         raise InputError("EXR pictures hold one model: compare in PNG or a video")
+    remove_leftovers(out)
     digits = max(4, len(str(len(film.cameras) - 1)))
     names = [f"{index:0{digits}d}" for index in range(len(film.cameras))]
     wanted = list(range(len(names)))

@@ -9,12 +9,16 @@ from __future__ import annotations
 import codecs
 import contextlib
 import errno
+import functools
 import json
 import os
+import re
 import secrets
 import shutil
+import socket
 import stat
 import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,7 +72,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         return
     named = Path(path)
     target = Path(os.path.realpath(named)) if named.is_symlink() else named
-    temporary = target.with_name(f".{target.stem[:80]}.{os.getpid()}.{secrets.token_hex(4)}.tmp{target.suffix[:40]}")
+    writer = f"{os.getpid()}.{_machine()}{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.stem[:80]}.{writer}.tmp{target.suffix[:40]}")
     try:
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(target))
@@ -84,6 +89,37 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):  # gone after the rename, or never made
             temporary.unlink()
+
+
+def remove_leftovers(folder: str | os.PathLike[str]) -> None:
+    """Removes the temporary files in ``folder`` of writers of this machine that were killed: of processes that are gone."""
+    for path in Path(folder).glob(".*.tmp*"):
+        made_by = _TEMPORARY.fullmatch(path.name)
+        if made_by and made_by["machine"] == _machine() and not _is_running(int(made_by["process"])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+_TEMPORARY = re.compile(r"\..*\.(?P<process>[0-9]{1,10})\.(?P<machine>[0-9a-f]{8})[0-9a-f]{8}\.tmp(\..*)?")
+
+
+@functools.cache
+def _machine() -> str:
+    """This machine among those that may share a folder, eight hexadecimal digits."""
+    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
+
+
+def _is_running(process: int) -> bool:
+    """Whether there is such a process on this machine; where the system does not tell, yes."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's; a number that no process has
+        return True
+    return True
 
 
 @contextlib.contextmanager

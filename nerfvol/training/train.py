@@ -28,7 +28,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
-from nerfvol.files.atomic import write_json
+from nerfvol.files.atomic import remove_leftovers, write_json
 from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.files.lock import only_writer
 from nerfvol.kernels import ops
@@ -104,6 +104,7 @@ def train(
     out = check_folder(config)
     try:
         with only_writer(out, "trains"):
+            remove_leftovers(out)
             return _train(config, out, started, say, bar, watch)
     except InputError:
         with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays

@@ -78,6 +78,13 @@ def test_killed_writer_leaves_the_old_file(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, str(target)], cwd=root)
     assert done.returncode != 0
     assert target.read_bytes() == b"old"
+    (left,) = (path for path in tmp_path.iterdir() if path != target)
+    with atomic.atomic_write(tmp_path / "b.bin") as alive:  # of a process that is there
+        alive.write_bytes(b"half")
+        elsewhere = left.with_name(left.name.replace(atomic._machine(), "0" * 8))  # of another machine
+        elsewhere.touch()
+        atomic.remove_leftovers(tmp_path)
+        assert set(tmp_path.iterdir()) == {target, alive, elsewhere}
 
 
 def test_synced_before_it_is_renamed(tmp_path, monkeypatch):
