@@ -96,8 +96,12 @@ class Film:
         return out
 
     def depths(self) -> tuple[float, float]:
-        """What pictures of depth are scaled by, the same for all views."""
-        return depth_range(self.model, self.cameras)
+        """What pictures of depth are scaled by, the same for all views; (0, 1) where there is none."""
+        return depth_range(self.model, self.cameras) if self.shows_depth() else (0.0, 1.0)
+
+    def shows_depth(self) -> bool:
+        """Whether a picture of distances is among what is drawn."""
+        return not {"depth", "median_depth"}.isdisjoint((self.output, *self.aov))
 
 
 T = TypeVar("T")
@@ -216,7 +220,7 @@ def write_pictures(
                   if not (ours and all((out / f"{names[k]}{end}").is_file() for end in ends))]  # fmt: skip
     depths = film.depths()
     document = cameras_document(film.cameras, [f"{name}.{suffix}" for name in names])
-    if suffix == "png" and {"depth", "median_depth"} & {film.output, *film.aov}:
+    if suffix == "png" and film.shows_depth():
         document["depth_range"] = depths
     write_json(out / "cameras.json", document)
     made = (each or one_by_one)(lambda camera: film.files(camera, depths, suffix), [film.cameras[k] for k in wanted])

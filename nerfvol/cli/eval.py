@@ -138,13 +138,13 @@ def _on_cluster(
     loaded: dict[str, Any],
     on_view: Any,
 ) -> dict[str, Any]:
-    from nerfvol.cluster.engine import connect
     from nerfvol.cluster.views import evaluate
 
     background, early_stop_eps, lod = drawing
     settings = {"background": list(background), "early_stop_eps": early_stop_eps, "lod": lod, **loaded}
-    with connect(where) as client:
-        return evaluate(client, target.path, dataset, settings, lambda text: print(text, file=sys.stderr), on_view)
+    return evaluate(
+        where, target.path, target.model, dataset, settings, lambda text: print(text, file=sys.stderr), on_view
+    )
 
 
 def _compare_with_truth(target: Target, path: str, folder: str | None) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
+import functools
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -125,23 +125,17 @@ def run(options: RenderOptions) -> int:
     started = time.perf_counter()
     files = {MODEL: target.path} | ({COMPARED: compared.path} if compared else {})
     suffix = None if ending in VIDEO_ENDINGS else "png" if ending else options.format
-    with contextlib.ExitStack() as stack:
-        each = None
-        if options.cluster is not None:
-            from nerfvol.cluster.engine import connect
-
-            on_cluster = OnCluster(stack.enter_context(connect(options.cluster)), film, files, suffix=suffix)
-            for message in on_cluster.messages:
-                print(message, file=sys.stderr)
-            each = on_cluster
-        drawn, written = len(cameras), [out]
-        if ending in VIDEO_ENDINGS:
-            written = write_videos(out, film, fps, each)
-        elif ending:
-            written = write_picture(out, film)
-        else:
-            chosen = _chosen(options, len(cameras))
-            drawn = write_pictures(out, film, options.format, chosen, each, identity(film, files, suffix=suffix))
+    each = None
+    if options.cluster is not None:
+        each = OnCluster(options.cluster, film, files, functools.partial(print, file=sys.stderr), suffix=suffix)
+    drawn, written = len(cameras), [out]
+    if ending in VIDEO_ENDINGS:
+        written = write_videos(out, film, fps, each)
+    elif ending:
+        written = write_picture(out, film)
+    else:
+        chosen = _chosen(options, len(cameras))
+        drawn = write_pictures(out, film, options.format, chosen, each, identity(film, files, suffix=suffix))
     seconds = time.perf_counter() - started
     where = ", ".join(map(str, written))
     there = f", {len(cameras)} in the path" if drawn != len(cameras) else ""

@@ -72,21 +72,17 @@ def _trained(options: SweepOptions, cells: list[dict[str, Any]]) -> Any:
 def _on_cluster(options: SweepOptions, cells: list[dict[str, Any]]) -> Any:
     import sys
 
-    from nerfvol.cluster.engine import connect
-    from nerfvol.cluster.fit import Needs, with_data
+    from nerfvol.cluster.needs import Needs, with_data
+    from nerfvol.cluster.share import shared_out
     from nerfvol.cluster.tasks import Job
-    from nerfvol.cluster.window import Window
 
     assert options.cluster is not None
     job = Job("nerfvol.measure.sweep:train_cell", {"threads": options.threads or 1})
     folders = sorted(
         {str(cell["settings"]["data"]) for cell in cells if Path(str(cell["settings"].get("data"))).is_dir()}
     )
-    with connect(options.cluster) as client:
-        window = Window(client, job, Needs(data=with_data(folders)), repeat_late=False)
-        for message in window.messages:
-            print(message, file=sys.stderr)
-        yield from window.results(cells)
+    needs = Needs(data=with_data(folders))
+    return shared_out(options.cluster, job, needs, cells, lambda text: print(text, file=sys.stderr), repeat=False)
 
 
 COMMAND = Command(

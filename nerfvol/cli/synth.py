@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -23,8 +22,7 @@ def run(arguments: list[str]) -> int:
     argv, where = _without_cluster(arguments)
     if where is None:
         return main(argv) or 0
-    with contextlib.ExitStack() as stack:
-        return main(argv, _on_cluster(where, argv, stack)) or 0
+    return main(argv, _on_cluster(where, argv)) or 0
 
 
 def _without_cluster(arguments: Sequence[str]) -> tuple[list[str], str | None]:
@@ -44,17 +42,15 @@ def _without_cluster(arguments: Sequence[str]) -> tuple[list[str], str | None]:
     return argv, where
 
 
-def _on_cluster(where: str, argv: list[str], stack: contextlib.ExitStack) -> Callable[[Sequence[Any]], Iterable[Any]]:
-    """Renders views and parts of views on the workers, in the form that data_synth asks for; connects when the first are
-    asked for."""
+def _on_cluster(where: str, argv: list[str]) -> Callable[[Sequence[Any]], Iterable[Any]]:
+    """Renders views and parts of views on the workers, in the form that data_synth asks for."""
 
     def each(pieces: Sequence[Any]) -> Iterable[Any]:
         if not pieces:
             return []
-        from nerfvol.cluster.engine import connect
-        from nerfvol.cluster.fit import Needs, with_data
+        from nerfvol.cluster.needs import Needs, with_data
+        from nerfvol.cluster.share import shared_out
         from nerfvol.cluster.tasks import Job
-        from nerfvol.cluster.window import Window
 
         words = [word.rpartition("=")[2] for word in argv]
         files = [
@@ -63,14 +59,11 @@ def _on_cluster(where: str, argv: list[str], stack: contextlib.ExitStack) -> Cal
         here = {word: str(Path(word).resolve()) for word in files}
         resolved = [word if (w := word.rpartition("=")[2]) not in here else word.replace(w, here[w]) for word in argv]
         job = Job("data_synth.cli:render_task", {"argv": resolved}, threads="data_synth.jit:use_threads")
-        client = stack.enter_context(connect(where))
         integrator = next((argv[k + 1] for k, word in enumerate(argv[:-1]) if word == "--integrator"), "")
         probe = f"data_synth.cli:probe?{argv[0]}:{integrator}"
         # Workers may have to compile first.
-        window = Window(client, job, Needs((probe,), with_data(list(here.values())), patience=600.0))
-        for message in window.messages:
-            print(message, file=sys.stderr)
-        return window.results(list(pieces))
+        needs = Needs((probe,), with_data(list(here.values())), patience=600.0)
+        return shared_out(where, job, needs, list(pieces), lambda text: print(text, file=sys.stderr))
 
     return each
 

@@ -7,6 +7,7 @@ on the loopback interface, its dashboard too, and docs/cluster.md says how to cl
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import re
@@ -17,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerfvol.cluster.copies import Keeper, may_copy
 from nerfvol.errors import InputError
 from nerfvol.machine import usable_cores
 
@@ -31,6 +33,7 @@ SETTINGS = {
     "distributed.scheduler.allowed-failures": 10,  # deaths of workers count against every task that waited there
     "distributed.comm.timeouts.connect": "10s",
     "distributed.admin.log-format": "%(message)s",
+    "distributed.worker.profile.enabled": False,  # it looks at every worker a hundred times a second
     # The engine has its processes return freed memory at once, which costs a frame 10 ms of page faults.
     "distributed.nanny.pre-spawn-environ": {
         "OMP_NUM_THREADS": "1",
@@ -116,26 +119,64 @@ def _leave(client: Client) -> None:
 
 @contextlib.contextmanager
 def _own_cluster(processes: int) -> Iterator[str]:
-    """The address of a scheduler with ``processes`` workers, on the loopback interface alone."""
-    import distributed
+    """The address of a scheduler with ``processes`` workers, on the loopback interface alone.
 
+    The workers are copies of this process where those are sound, else started by the engine, which takes seconds longer.
+    """
     if not 1 <= processes <= 1024:
         raise InputError(f"--cluster local:N takes 1 to 1024 processes, got {processes} ({usable_cores()} cores here)")
-    with tempfile.TemporaryDirectory(prefix="nerfvol-cluster-") as scratch:
+    with contextlib.ExitStack() as stack:
+        scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="nerfvol-cluster-"))
+        keeper = Keeper(processes) if may_copy() else None
         try:
-            cluster = distributed.LocalCluster(
-                n_workers=processes,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",  # None would open 8787 on every interface
-                local_directory=scratch,
-                silence_logs=logging.CRITICAL,
-                memory_limit=0,
-            )
+            cluster = _local_cluster(0 if keeper else processes, scratch)
         except (OSError, RuntimeError, TimeoutError) as error:
+            if keeper:
+                keeper.close()
             raise InputError(f"--cluster local:{processes}: its processes did not start ({error})") from error
-        try:
-            yield cluster.scheduler_address
-        finally:
-            with contextlib.suppress(OSError, TimeoutError):
-                cluster.close(timeout=10)
+        stack.callback(_close, cluster)
+        if keeper:
+            stack.callback(keeper.close)
+            keeper.start(functools.partial(serve, cluster.scheduler_address, scratch))
+        yield cluster.scheduler_address
+
+
+def _local_cluster(processes: int, scratch: str) -> Any:
+    import distributed
+
+    return distributed.LocalCluster(
+        n_workers=processes,
+        threads_per_worker=1,
+        host="127.0.0.1",
+        dashboard_address="127.0.0.1:0",  # None would open 8787 on every interface
+        local_directory=scratch,
+        silence_logs=logging.CRITICAL,
+        memory_limit=0,
+    )
+
+
+def _close(cluster: Any) -> None:
+    with contextlib.suppress(OSError, TimeoutError):
+        cluster.close(timeout=10)
+
+
+def serve(address: str, scratch: str, number: int) -> None:
+    """Works for the scheduler at ``address`` of this machine until it is gone: what a copy of a client does."""
+    import asyncio
+
+    import distributed
+
+    async def work() -> None:
+        worker = distributed.Worker(
+            address,
+            nthreads=1,
+            name=str(number),
+            host="127.0.0.1",
+            dashboard=False,
+            local_directory=scratch,
+            memory_limit=0,
+        )
+        async with worker:
+            await worker.finished()
+
+    asyncio.run(work())

@@ -10,9 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.cluster.needs import Needs
+from nerfvol.cluster.share import lend, lent, shared_out
+from nerfvol.cluster.ship import describe
 from nerfvol.cluster.tasks import Job
 from nerfvol.film import Film, with_progress
-from nerfvol.models import load_model
+from nerfvol.models import Model, load_model
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -39,22 +42,27 @@ def identity(film: Film, files: Mapping[str, Path], **more: Any) -> str:
 
 
 class OnCluster:
-    """Draws a film's views on a client's workers (film.Each); ``messages``: sentences on workers that take no part."""
+    """Draws a film's views on the workers of the engine ``where`` (film.Each), an address or a client of one.
 
-    def __init__(self, client: Client, film: Film, files: Mapping[str, Path], **more: Any) -> None:
-        from nerfvol.cluster.fit import Needs
-        from nerfvol.cluster.ship import describe
-        from nerfvol.cluster.window import Window
+    ``say``: gets sentences on workers that take no part. The engine is asked for when the first view is.
+    """
 
-        shipped = {name: describe(path) for name, path in files.items()}
-        depths = film.depths()
-        job = Job("nerfvol.cluster.frames:draw", settings_of(film, depths=list(depths), **more), shipped)
-        self._window = Window(client, job, Needs(room=sum(file.size for file in shipped.values())))
-        self.messages = self._window.messages
+    def __init__(
+        self, where: str | Client, film: Film, files: Mapping[str, Path], say: Callable[[str], object], **more: Any
+    ) -> None:
+        self._where, self._say = where, say
+        self._film, self._files, self._more = film, files, more
 
     def __call__(self, draw: Callable[[Camera], Any], cameras: Sequence[Camera]) -> Iterator[Any]:
         """The views in order; ``draw`` says what to do here and is done there, by the name in the settings."""
-        return with_progress(self._window.results(list(cameras)), len(cameras))
+        film, shipped = self._film, {name: describe(path) for name, path in self._files.items()}
+        for name, model in ((MODEL, film.model), (COMPARED, film.compare)):
+            if model is not None:
+                lend(shipped[name].path, model, shipped[name].path)
+        settings = settings_of(film, depths=list(film.depths()), **self._more)
+        job = Job("nerfvol.cluster.frames:draw", settings, shipped)
+        needs = Needs(room=sum(file.size for file in shipped.values()))
+        return with_progress(shared_out(self._where, job, needs, list(cameras), self._say), len(cameras))
 
 
 def draw(settings: Mapping[str, Any], files: Mapping[str, Path], camera: Camera) -> Any:
@@ -70,8 +78,13 @@ def draw(settings: Mapping[str, Any], files: Mapping[str, Path], camera: Camera)
 def _film(settings: str, model: Path, compared: Path | None) -> Film:
     """The film that a worker draws; it keeps the last ones open."""
     s = json.loads(settings)
-    opened = load_model(model)
+    opened = _opened(model)
     if s["composite"] is not None:
         opened.composite = s["composite"]  # type: ignore[attr-defined]
-    compare = None if compared is None else load_model(compared)
+    compare = None if compared is None else _opened(compared)
     return Film(opened, [], s["background"], s["aov"], s["early_stop_eps"], s["lod"], s["output"], compare)
+
+
+def _opened(path: Path) -> Model:
+    """The model at ``path``, which this process or the one it is a copy of may have open."""
+    return lent(str(path), path) or load_model(path)

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerfvol.cluster.needs import Needs, with_data
+from nerfvol.cluster.share import lend, lent, shared_out
+from nerfvol.cluster.ship import describe
 from nerfvol.cluster.tasks import Job
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.load import load_dataset
@@ -25,26 +28,22 @@ LOADING = ("data", "split", "downscale", "holdout", "scene")
 
 
 def evaluate(
-    client: Client, path: Path, dataset: Dataset, settings: Mapping[str, Any],
+    where: str | Client, target: Path, model: Model, dataset: Dataset, settings: Mapping[str, Any],
     say: Callable[[str], object], on_view: Callable[[int, Any, Any], None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """What scores.evaluate returns of the model in ``path``, the views drawn and scored by a client's workers.
+    """What scores.evaluate returns of ``model``, which lies at ``target``; the views are drawn and scored by the workers of
+    the engine ``where``, an address or a client of one.
 
-    ``settings``: background, early_stop_eps, lod, composite and LOADING, with which ``dataset`` was loaded; the workers must
-    have the same files at the same place. ``say``: gets sentences on workers that take no part.
+    ``settings``: background, early_stop_eps, lod and LOADING, with which ``dataset`` was loaded; the workers must have the same
+    files at the same place. ``say``: gets sentences on workers that take no part.
     """
-    from nerfvol.cluster.fit import Needs, with_data
-    from nerfvol.cluster.ship import describe
-    from nerfvol.cluster.window import Window
-
-    file, data = describe(path), str(Path(settings["data"]).resolve())
+    file, data = describe(target), str(Path(settings["data"]).resolve())
     job = Job("nerfvol.cluster.views:score", {**settings, "data": data, "image": on_view is not None}, {"model": file})
-    window = Window(client, job, Needs(data=with_data([data]), room=file.size))
-    for message in window.messages:
-        say(message)
+    lend(file.path, (model, dataset), file.path)
     indices = scores.scored_views(dataset)
+    results = shared_out(where, job, Needs(data=with_data([data]), room=file.size), indices, say)
     rows = []
-    for index, (row, image) in zip(indices, with_progress(window.results(indices), len(indices)), strict=True):
+    for index, (row, image) in zip(indices, with_progress(results, len(indices)), strict=True):
         rows.append(row)
         if on_view is not None:
             on_view(index, dataset.composited(index, settings["background"]), image)
@@ -53,7 +52,8 @@ def evaluate(
 
 def score(settings: Mapping[str, Any], files: Mapping[str, Path], index: int) -> tuple[dict[str, Any], Any]:
     """The row of one view, and its render where settings["image"] asks for it. A task (cluster.tasks)."""
-    model, dataset = _opened(json.dumps(dict(settings), sort_keys=True), files["model"])
+    path = files["model"]
+    model, dataset = lent(str(path), path) or _opened(json.dumps(dict(settings), sort_keys=True), path)
     started = time.perf_counter()
     drawing = settings["background"], ("rgb",), settings["early_stop_eps"], settings["lod"]
     image = model.render(dataset.cameras[index], *drawing)["rgb"]

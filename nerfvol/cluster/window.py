@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from nerfvol.cluster import ship
-from nerfvol.cluster.fit import Needs, fit_workers, welcome
+from nerfvol.cluster.copies import Ahead
+from nerfvol.cluster.fit import fit_workers, welcome
+from nerfvol.cluster.needs import Needs
 from nerfvol.cluster.tasks import Done, Job, Missing, run
 from nerfvol.errors import InputError
 
@@ -24,19 +26,21 @@ if TYPE_CHECKING:
 
 TASKS_A_WORKER = 3
 """On their way at once: one that runs, one that waits there, one whose result travels."""
-TASK_SECONDS = 0.5
-"""A task takes at least about this long, so that its 2-3 ms of scheduling do not count."""
+TASK_SECONDS, LAST_SECONDS = 0.8, 0.1
+"""A task takes at least about this long, so that its 5-10 ms of scheduling do not count; the last ones less, so that all
+workers end at one time."""
 PATIENCE_FACTOR, LEAST_PATIENCE = 5.0, 10.0
 ATTEMPTS = 5
 
 
 @dataclass
 class _Task:
-    """Items first...last-1 given out; future: the engine's; attempts: which try this is."""
+    """Items first...last-1 given out; future: the engine's, None for what a copy of this process does ahead of it;
+    attempts: which try this is."""
 
     first: int
     last: int
-    future: Future
+    future: Future | None
     started: float
     attempts: int
 
@@ -57,21 +61,21 @@ class Window:
         self._asked = -1e9
         self._tasks: dict[Fetch[Any], _Task] = {}
 
-    def results(self, items: Sequence[Any]) -> Iterator[Any]:
-        """The function's result for each of ``items``, in their order.
+    def results(self, items: Sequence[Any], ahead: Ahead | None = None) -> Iterator[Any]:
+        """The function's result for each of ``items``, in their order; ``ahead`` has begun with the first of them.
 
         Raises:
             InputError: the engine is gone, or a task fails wherever it is tried.
         """
         ready: dict[int, Done] = {}
-        submitted = yielded = 0
+        submitted, yielded = 0 if ahead is None else self._taken_over(ahead), 0
         try:
             while yielded < len(items):
                 while (
                     submitted < len(items)
                     and submitted - yielded < TASKS_A_WORKER * len(self._workers()) * self._group()
                 ):
-                    last = min(submitted + self._group(), len(items))
+                    last = submitted + self._next_group(len(items) - submitted)
                     self._submit(items, submitted, last)
                     submitted = last
                 for first, done in self._finished(items):
@@ -98,12 +102,24 @@ class Window:
             self._asked = time.monotonic()
         return [address for address in self._fit if address not in self._silent] or self._fit or [""]
 
-    def _group(self) -> int:
-        """Items a task."""
+    def _group(self, seconds: float = TASK_SECONDS) -> int:
+        """Items of a task that takes so long."""
         if not self._times:
             return 1
-        least = max(TASK_SECONDS, 0.005 * len(self._workers()))
+        least = max(seconds, 0.005 * len(self._workers()))
         return max(1, min(64, round(least / max(statistics.median(self._times[-50:]), 1e-4))))
+
+    def _next_group(self, left: int) -> int:
+        """Items of the next task where so many are left."""
+        share = max(left // (TASKS_A_WORKER * len(self._workers())), self._group(LAST_SECONDS))
+        return min(self._group(), share, left)
+
+    def _taken_over(self, ahead: Ahead) -> int:
+        """How many items are not given out, for a copy of this process has made them or is about to."""
+        count, fetch = ahead.stop()
+        if count:
+            self._tasks[fetch] = _Task(0, count, None, time.monotonic(), 1)
+        return count
 
     def _submit(self, items: Sequence[Any], first: int, last: int, attempts: int = 1) -> None:
         key = f"nerfvol-{self._id}-{first}-{attempts}-{uuid.uuid4().hex[:4]}"
@@ -157,6 +173,9 @@ class Window:
         from distributed.client import FutureCancelledError
         from distributed.scheduler import KilledWorker
 
+        if task.future is None:  # what went wrong there, a worker says
+            self._submit(items, task.first, task.last)
+            return
         if isinstance(error, InputError):
             raise error
         if isinstance(error, FutureCancelledError | asyncio.CancelledError):
@@ -180,8 +199,10 @@ class Window:
             self._silent.update(self._holders(task.future))
             self._submit(items, task.first, task.last, task.attempts + 1)
 
-    def _holders(self, future: Future) -> list[str]:
+    def _holders(self, future: Future | None) -> list[str]:
         """Who runs a task or holds its result."""
+        if future is None:
+            return []
         try:
             if future.status == "finished":
                 return list(cast(dict[str, Any], self.client.who_has([future]))[str(future.key)])
@@ -198,7 +219,8 @@ class Window:
     def _release(fetch: Fetch[Any], task: _Task) -> None:
         with contextlib.suppress(Exception):  # the engine may be gone
             fetch.cancel()
-            task.future.cancel(force=True)
+            if task.future is not None:
+                task.future.cancel(force=True)
 
     def _gone(self) -> InputError:
         return InputError(

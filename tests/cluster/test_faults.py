@@ -16,8 +16,8 @@ pytest.importorskip("distributed", reason="the engine is the extra nerfvol[clust
 from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.cluster import fit, ship
 from nerfvol.cluster.engine import connect
-from nerfvol.cluster.fit import Needs
 from nerfvol.cluster.frames import MODEL, OnCluster
+from nerfvol.cluster.needs import Needs
 from nerfvol.cluster.tasks import Job
 from nerfvol.cluster.window import Window
 from nerfvol.errors import InputError
@@ -59,7 +59,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def drawn_by(client, model: Path, out: Path) -> int:
     out.mkdir(exist_ok=True)
     film = film_of(model)
-    on_cluster = OnCluster(client, film, {MODEL: model}, suffix="png")
+    on_cluster = OnCluster(client, film, {MODEL: model}, print, suffix="png")
     return write_pictures(out, film, "png", Chosen(0, FRAMES - 1), on_cluster, "test")
 
 
@@ -74,7 +74,7 @@ def client():
 def test_any_number_of_workers_and_frames_a_task_makes_the_same_bytes(
     model, expected, tmp_path, monkeypatch, where, group
 ):
-    monkeypatch.setattr(Window, "_group", lambda self: group)
+    monkeypatch.setattr(Window, "_group", lambda self, seconds=0.0: group)
     with connect(where) as found:
         assert drawn_by(found, model, tmp_path) == FRAMES
     assert contents(tmp_path) == expected
@@ -94,7 +94,7 @@ def restored(client) -> None:
 def test_a_worker_killed_in_any_phase_loses_nothing_and_does_nothing_twice(
     client, model, expected, tmp_path, phase, monkeypatch
 ):
-    monkeypatch.setattr(Window, "_group", lambda self: 2)
+    monkeypatch.setattr(Window, "_group", lambda self, seconds=0.0: 2)
     marker, out, written = tmp_path / "died", tmp_path / "out", []
     from nerfvol import film
 

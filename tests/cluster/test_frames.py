@@ -124,7 +124,9 @@ def test_a_large_path_traced_picture_is_shared_by_workers(tmp_path, command, mon
         monkeypatch.setattr(parts, name, value)
     given, asked = ("synth", "sphere", "--size", "12x10", "--integrator", "path", "--spp", "40"), []
     results = Window.results
-    monkeypatch.setattr(Window, "results", lambda self, items: asked.extend(items) or results(self, items))
+    monkeypatch.setattr(
+        Window, "results", lambda self, items, ahead=None: asked.extend(items) or results(self, items, ahead)
+    )
     assert command(*given, "--picture", tmp_path / "here.png")[0] == 0
     assert command(*given, "--picture", tmp_path / "there.png", "--cluster", "local:2")[0] == 0
     assert len({piece.part for piece in asked}) == len(asked) > 4
