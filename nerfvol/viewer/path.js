@@ -64,8 +64,9 @@ function readPath(document_) {
 
 // ------------------------------------------------------------------ the crop box
 const SIDES = ["x", "y", "z"], around = settings.box;
-let cropped = null;
+let cropped = null, cropBox = null;
 function crop(box) {
+  cropBox = box;
   SIDES.forEach((side, k) => [0, 1].forEach((end) => {
     const given = Object.assign($(side + end), { min: around[0][k], max: around[1][k], step: "any" });
     given.value = (box || around)[end][k];

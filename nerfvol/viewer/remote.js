@@ -129,7 +129,8 @@ function frusta(cameras, page, wanted, choose) {
 async function film(find, page) {
   const path = page.path();
   if (!path.frames.length || !path.keyframes.length) throw new ModelError("Add views to the camera path first");
-  let state = await (await ask("/render", { fps: path.fps }, { method: "POST", body: JSON.stringify(path) })).json();
+  const crop = page.box()?.flat().join(","), query = { fps: path.fps, ...(crop && { crop }) };
+  let state = await (await ask("/render", query, { method: "POST", body: JSON.stringify(path) })).json();
   const bar = find("progress");
   bar.hidden = find("halt").hidden = false;
   while (!state.finished) {

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from nerfvol.config.values import box
 from nerfvol.errors import InputError
 from nerfvol.export.page import build_page
 from nerfvol.files.atomic import explain_os_error
@@ -215,7 +216,7 @@ class _Handler(BaseHTTPRequestHandler):
         with server.video_lock:
             if server.video is not None and not server.video.state()["finished"]:
                 raise ValueError("a video is being drawn already")
-            server.video = Video(server.shown, edition, body, fps, server.folder)
+            server.video = Video(server.shown, edition, body, fps, server.folder, self._crop())
         self._json(server.video.state())
 
     def _stop(self) -> None:
@@ -234,6 +235,10 @@ class _Handler(BaseHTTPRequestHandler):
             raise LookupError("there is no video yet")
         headers = {"Content-Disposition": 'attachment; filename="path.mp4"'}
         self._send(HTTPStatus.OK, video.file.read_bytes(), "video/mp4", headers)
+
+    def _crop(self) -> tuple[float, ...] | None:
+        """The box that the page shows alone, None where it shows all."""
+        return box(self.query.get("crop"))
 
     def _number(self, name: str) -> int:
         text = self.query.get(name, "")

@@ -6,7 +6,7 @@ import io
 import math
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.export.page import page_settings, poster
 from nerfvol.export.page_size import stored
+from nerfvol.export.part import part_of
 from nerfvol.files.atomic import write_bytes
 from nerfvol.files.pictures import error_map, to_uint8
 from nerfvol.film import Film, write_videos
@@ -156,8 +157,14 @@ class Stopped(Exception):
 class Video:
     """A camera path on its way to an MP4 in ``folder``, drawn by the native kernels in a thread of its own."""
 
-    def __init__(self, shown: Shown, edition: Edition, path: bytes, fps: int, folder: Path) -> None:
-        """path: a camera path as JSON, see cameras.paths.load_cameras; InputError where it is none."""
+    def __init__(
+        self, shown: Shown, edition: Edition, path: bytes, fps: int, folder: Path, crop: Sequence[float] | None = None
+    ) -> None:
+        """path: a camera path as JSON, see cameras.paths.load_cameras; crop: the box that alone is drawn (export.part).
+
+        Raises:
+            InputError: it is no path, or nothing of the model lies in the box.
+        """
         with tempfile.TemporaryDirectory() as place:
             written = Path(place) / "path.json"
             write_bytes(written, path)
@@ -168,6 +175,7 @@ class Video:
         if len(self._cameras) > MOST_FRAMES:
             raise InputError(f"the path has {len(self._cameras)} pictures, at most {MOST_FRAMES} are drawn")
         self._shown, self._edition, self._fps = shown, edition, fps
+        self.crop, self._model = crop, part_of(edition.model, crop=crop)
         self.file = folder / "path.mp4"
         self.done, self.fault, self._stop = 0, "", False
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -192,13 +200,13 @@ class Video:
         if self._stop:
             raise Stopped
         with self._shown._drawing:
-            image = self._edition.model.render(camera, background, outputs, *rest)
+            image = self._model.render(camera, background, outputs, *rest)
         self.done += "rgb" in outputs
         return image
 
     def aabb(self) -> Any:
         """As the model's."""
-        return self._edition.model.aabb()
+        return self._model.aabb()
 
     def _run(self) -> None:
         try:

@@ -60,7 +60,7 @@ async function open() {
   changed();
   if (!remote) return;
   const distance = (m) => Math.max(norm(sub([m[0][3], m[1][3], m[2][3]], first.pivot)), 1e-6);
-  remote.build($("remote"), { look, path: pathNow, distance, camera: () => state.camera, extent }).catch((error) => fault(error.message));
+  remote.build($("remote"), { look, path: pathNow, box: () => cropBox, distance, camera: () => state.camera, extent }).catch((error) => fault(error.message));
   remote.follow(async (newer) => {
     drawing.isSplats = readArrays(newer).document.format === "nerfvol splats";
     model = newer;

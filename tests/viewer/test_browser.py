@@ -348,7 +348,11 @@ def test_a_served_page_jumps_to_photographs_and_follows_a_new_model(browser):
             page.fill(f"#{name}", value)
         page.click("#film")
         wait(page, "document.querySelector('#filmed a')")
-        assert server.video.state()["done"] == 6
+        assert server.video.state()["done"] == 6 and server.video.crop is None
+        page.evaluate("(document.querySelector('#filmed a').remove(), nerfvol.crop([[-1, -1, -1], [0.25, 1, 1]]), 0)")
+        page.click("#film")
+        wait(page, "document.querySelector('#filmed a')")
+        assert server.video.crop == (-1, -1, -1, 0.25, 1, 1)
     finally:
         page.close()
         server.close()

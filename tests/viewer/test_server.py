@@ -3,6 +3,7 @@
 import http.client
 import json
 import socket
+import subprocess
 import threading
 import time
 
@@ -14,6 +15,7 @@ from nerfvol.cameras.paths import cameras_document, orbit_cameras
 from nerfvol.datasets.bounds import SceneBounds
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
+from nerfvol.export.part import part_of
 from nerfvol.files.pictures import to_uint8
 from nerfvol.viewer import server as server_module
 from nerfvol.viewer.server import ViewServer
@@ -125,10 +127,9 @@ def test_photographs_are_compared(server):
     assert ask(server, "/photograph?index=2")[1].startswith(b"\xff\xd8")
 
 
-def test_a_path_becomes_a_video(server, tmp_path):
-    cameras = orbit_cameras(4, server.shown.edition.model.metadata["orbit"], (32, 32))
-    path = json.dumps(cameras_document(cameras, list("abcd")))
-    answer, data = ask(server, "/render?fps=10", "POST", path)
+def video_of(server, query: str, path: str, file) -> list[np.ndarray]:
+    """The frames of the video of 32 x 32 pixels that the server makes of a path."""
+    answer, data = ask(server, f"/render?{query}", "POST", path)
     assert answer.status == 200, data
     state = json.loads(data)
     end = time.monotonic() + 60
@@ -138,10 +139,32 @@ def test_a_path_becomes_a_video(server, tmp_path):
     assert state == {"done": 4, "of": 4, "finished": True, "fault": ""}
     answer, video = ask(server, "/video")
     assert video[4:8] == b"ftyp" and "attachment" in answer.getheader("Content-Disposition")
-    (tmp_path / "v.mp4").write_bytes(video)
+    file.write_bytes(video)
     import imageio_ffmpeg
 
-    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "v.mp4"))[0] == 4
+    decode = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(file), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(decode, check=True, capture_output=True).stdout
+    return list(np.frombuffer(raw, np.uint8).reshape(-1, 32, 32, 3))
+
+
+def test_a_path_becomes_a_video(server, tmp_path):
+    cameras = orbit_cameras(4, server.shown.edition.model.metadata["orbit"], (32, 32))
+    path = json.dumps(cameras_document(cameras, list("abcd")))
+    assert len(video_of(server, "fps=10", path, tmp_path / "v.mp4")) == 4
+
+
+def test_a_video_shows_what_the_crop_box_leaves(server, tmp_path):
+    model = server.shown.edition.model
+    cameras = orbit_cameras(4, model.metadata["orbit"], (32, 32))
+    path, crop = json.dumps(cameras_document(cameras, list("abcd"))), (-2.0, -2.0, -2.0, 0.1, 2.0, 2.0)
+    frames = video_of(server, f"fps=10&crop={','.join(map(str, crop))}", path, tmp_path / "v.mp4")
+    for camera, frame in zip(cameras, frames, strict=True):
+        part, whole = (to_uint8(m.render(camera)["rgb"]).astype(float) for m in (part_of(model, crop=crop), model))
+        assert abs(frame - part).mean() < abs(frame - whole).mean()
+    before = server.video
+    for crop, said in (("5,5,5,6,6,6", b"nothing of the model lies in this box"), ("1,2", b"expected x0,y0,z0")):
+        answer, data = ask(server, f"/render?fps=10&crop={crop}", "POST", path)
+        assert answer.status == 400 and said in data and server.video is before
 
 
 def test_who_waits_hears_of_a_new_model(server, shown, monkeypatch):
