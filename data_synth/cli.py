@@ -79,6 +79,8 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     p.add_argument("--fill", metavar="HOW", help="deep: sweep, eager or lazy")
     lights = ", ".join(scenes.LIGHTS)
     p.add_argument("--light", metavar="NAME,...", help=f"lights instead of the scene's own: {lights}")
+    p.add_argument("--suns", type=int, default=0, metavar="N", help="for relighting: each view under one of N suns, test views "
+                   "under others; lights.json tells them all")  # fmt: skip
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a parameter of the scene")
     p.add_argument(
         "--volume",
@@ -223,9 +225,13 @@ def _render(args: argparse.Namespace, each: Each | None) -> int:
         got = "both" if args.out else "nothing"
         raise InputError(f"--out, --picture: expected a folder to write or one portrait, got {got}")
     started = time.perf_counter()
-    options = Options(args.views, _size(args.size), args.seed, None, args.exr, None, _chosen(args.frames), each)
+    options = Options(
+        args.views, _size(args.size), args.seed, None, args.exr, None, _chosen(args.frames), each, args.suns
+    )
     if args.picture and (Path(args.picture).suffix not in (".jpg", ".png") or not Path(args.picture).parent.is_dir()):
         raise InputError(f"--picture: expected a .jpg or .png in a folder that exists, got {args.picture}")
+    if args.suns and (args.picture or args.light):
+        raise InputError(f"--suns: expected --out with it, and no {'--picture' if args.picture else '--light'}")
     if args.denoise and not args.picture:
         raise InputError("--denoise: expected --picture with it; data sets are truth, and that is what is rendered")
     scene = _scene(args)

@@ -19,6 +19,8 @@ from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.image import Picture, replacing
 from data_synth.integrators import Integrator
+from data_synth.scene import Scene
+from data_synth.suns import LIGHTS, Sun, document, shared_out, suns_of
 from data_synth.views import Each, Files, Renderable, View, encode, render_numbered, rendered
 
 PLAN, PROVENANCE = "plan.json", "provenance.json"
@@ -36,6 +38,8 @@ class Options:
     progress: called with (views done, views in all) after every view.
     chosen: of all views, counted through the splits, (first, last, step): these alone are rendered, and of these only those
     that are not there yet; the folder is complete, and says so, once all are, whoever made them. None: all.
+    suns: so many lights for training views, one a view, and others for test views, in place of the scene's own (``suns.py``);
+    0: the scene's own, all of them, in every view.
     each: renders views, large ones in parts, elsewhere; None: here, one after the other.
     """
 
@@ -47,12 +51,15 @@ class Options:
     progress: Callable[[int, int], None] | None = None
     chosen: tuple[int, int, int] | None = None
     each: Each | None = None
+    suns: int = 0
 
     def __post_init__(self) -> None:
         if self.views < 1:
             raise InputError(f"--views: expected at least 1, got {self.views}")
         if self.seed < 0:
             raise InputError(f"--seed: expected a whole number from 0 on, got {self.seed}")
+        if not 0 <= self.suns <= 1000:
+            raise InputError(f"--suns: expected 0 to 1000, got {self.suns}")
         if min(self.size) < 1 or max(self.size) > 16384:
             raise InputError(f"--size: expected 1 to 16384 pixels a side, got {self.size[0]}x{self.size[1]}")
 
@@ -78,7 +85,9 @@ def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Option
         raise InputError(f"--out: cannot make the folder {out_dir}: {error.strerror}") from error
     started = time.perf_counter()
     splits = split_cameras(scene, options.views, options.size, options.seed)
-    views, record = views_of(splits), _provenance(scene, options)
+    suns = suns_of(scene, options.suns) if options.suns else []
+    lit = shared_out(suns, splits)
+    views, record = views_of(splits, lit), _provenance(scene, options)
     wanted = views
     if options.chosen is not None:
         first, last, step = options.chosen
@@ -112,17 +121,25 @@ def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Option
     if not all(_is_there(out_dir, view, options.exr) for view in views):
         return out_dir
     for split, cameras in splits.items():
-        _write_json(out_dir / f"transforms_{split}.json", _transforms(scene, split, cameras))
+        _write_json(out_dir / f"transforms_{split}.json", _transforms(scene, split, cameras, lit[split]))
+    if suns and isinstance(scene, Scene):
+        _write_json(out_dir / LIGHTS, document(scene, suns))
     scene.write_truth(out_dir)
     _write_json(out_dir / PROVENANCE, record | {"seconds": round(time.perf_counter() - started, 3)})
     (out_dir / PLAN).unlink(missing_ok=True)
     return out_dir
 
 
-def views_of(splits: Mapping[str, Sequence[Camera]]) -> list[View]:
-    """All views of a data set, in the order of its splits."""
-    rows = [(f"{split}/r_{k}", camera) for split, cameras in splits.items() for k, camera in enumerate(cameras)]
-    return [View(number, name, camera) for number, (name, camera) in enumerate(rows)]
+def views_of(
+    splits: Mapping[str, Sequence[Camera]], lit: Mapping[str, Sequence[Sun | None]] | None = None
+) -> list[View]:
+    """All views of a data set, in the order of its splits; ``lit``: their suns."""
+    rows = [
+        (f"{split}/r_{k}", camera, None if lit is None else lit[split][k])
+        for split, cameras in splits.items()
+        for k, camera in enumerate(cameras)
+    ]
+    return [View(number, *row) for number, row in enumerate(rows)]
 
 
 def _done(files: Files) -> Future[Files]:
@@ -152,7 +169,9 @@ def _claim(out_dir: Path, record: dict, shared: bool) -> bool:
     if plan.is_file() and plan.read_text() == text:
         return True
     old = [p for p in out_dir.glob("*/*") if p.parent.name in SPLITS and re.fullmatch(r"\.?r_\d+.*\.(png|exr)", p.name)]
-    marks = [p for p in (plan, out_dir / PROVENANCE, *out_dir.glob("transforms_*.json")) if p.is_file()]
+    marks = [
+        p for p in (plan, out_dir / PROVENANCE, out_dir / LIGHTS, *out_dir.glob("transforms_*.json")) if p.is_file()
+    ]
     if shared and (old or marks):
         if not plan.is_file() and _complete(out_dir) == record:
             return False
@@ -175,9 +194,11 @@ def _complete(out_dir: Path) -> dict | None:
     return {key: value for key, value in found.items() if key != "seconds"} if isinstance(found, dict) else None
 
 
-def _transforms(scene: Renderable, split: str, cameras: list[Camera]) -> dict:
+def _transforms(scene: Renderable, split: str, cameras: list[Camera], lit: Sequence[Sun | None]) -> dict:
     frames = [
-        {"file_path": f"./{split}/r_{k}", "transform_matrix": camera.c2w.tolist()} for k, camera in enumerate(cameras)
+        {"file_path": f"./{split}/r_{k}", "transform_matrix": camera.c2w.tolist()}
+        | ({} if sun is None else {"light": sun.name})
+        for k, (camera, sun) in enumerate(zip(cameras, lit, strict=True))
     ]
     return {"camera_angle_x": cameras[0].angle_x, "aabb": scene.aabb.tolist(), "frames": frames}
 
@@ -193,6 +214,7 @@ def _provenance(scene: Renderable, options: Options) -> dict:
         "views": options.views,
         "size": list(options.size),
         "seed": options.seed,
+        **({"suns": options.suns} if options.suns else {}),
         "versions": {
             "data_synth": importlib.import_module("data_synth").__version__,
             "numpy": np.__version__,

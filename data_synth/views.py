@@ -15,17 +15,20 @@ from data_synth.image import Picture, encode_exr, encode_png
 from data_synth.integrators import Integrator
 from data_synth.parts import Part, joined
 from data_synth.scene import Scene
+from data_synth.suns import Sun, under
 
 Files = dict[str, bytes]
 """The files of a view by the end of their names."""
 
 
 class View(NamedTuple):
-    """One picture of a data set: its number through the splits, its name below the folder, its camera."""
+    """One picture of a data set: its number through the splits, its name below the folder, its camera, and the one light it
+    is taken under; None: the scene's own."""
 
     number: int
     name: str
     camera: Camera
+    sun: Sun | None = None
 
 
 class Piece(NamedTuple):
@@ -65,7 +68,14 @@ def render_view(scene: Renderable, camera: Camera, integrator: Integrator | None
 
 def render_numbered(scene: Renderable, integrator: Integrator | None, seed: int, view: View) -> Picture:
     """One view; its seed is that of the data set and its number, whoever renders it."""
-    return render_view(scene, view.camera, integrator, view_seed(seed, view))
+    return render_view(_lit(scene, view), view.camera, integrator, view_seed(seed, view))
+
+
+def _lit(scene: Renderable, view: View) -> Renderable:
+    if view.sun is None:
+        return scene
+    assert isinstance(scene, Scene)
+    return under(scene, view.sun)
 
 
 def view_seed(seed: int, view: View) -> int:
@@ -87,7 +97,9 @@ def render_piece(
         return encode(render_numbered(scene, integrator, seed, piece.view), scene.exposure, exr)
     if integrator is None or not isinstance(scene, Scene):
         raise InputError(f"the {scene.name} renders itself: it has no parts")
-    return integrator.sums(scene, piece.view.camera, view_seed(seed, piece.view), piece.part)
+    lit = _lit(scene, piece.view)
+    assert isinstance(lit, Scene)
+    return integrator.sums(lit, piece.view.camera, view_seed(seed, piece.view), piece.part)
 
 
 def pieces_of(integrator: Integrator | None, views: Sequence[View]) -> list[Piece]:

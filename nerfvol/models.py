@@ -62,6 +62,7 @@ FORMATS = {
     "nerfvol octree": "nerfvol.views:OctreeModel.load",
     "nerfvol splats": "nerfvol.views:SplatModel.load",
     "nerfvol field": "nerfvol.neural:FieldModel.load",
+    "nerfvol medium": "nerfvol.medium.model:MediumModel.load",
 }
 """The ``format`` key of a file's document, and what opens it."""
 SUFFIXES = {
@@ -72,7 +73,7 @@ SUFFIXES = {
 
 
 def load_model(target: str | os.PathLike[str]) -> Model:
-    """The model in a run folder or a file: our own octrees, splats and fields, the first two also in a page (.html),
+    """The model in a run folder or a file: our own octrees, splats, fields and media, the first two also in a page (.html),
     Gaussians or points in a .ply, Gaussians in a .spz, a PlenOctree in an .npz.
 
     Raises:

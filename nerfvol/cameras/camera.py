@@ -215,7 +215,7 @@ def _reaches(intrinsics: Intrinsics) -> NDArray[np.bool_] | None:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Intrinsics and a rigid pose.
+    """Intrinsics and a rigid pose, and the name of the light that the picture was taken under, where there are several.
 
     ``c2w`` (4, 4) or (3, 4) must be a rotation and a translation: its 3x3 part orthonormal and right-handed to within
     5e-3, as tools that write three decimals leave it; it is then replaced by the nearest exact rotation so that
@@ -224,6 +224,7 @@ class Camera:
 
     intrinsics: Intrinsics
     c2w: Float
+    light: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "c2w", rigid_pose(self.c2w))
@@ -253,11 +254,11 @@ class Camera:
 
     def scaled(self, k: int) -> Camera:
         """The camera of the image area-averaged over k x k blocks."""
-        return Camera(self.intrinsics.scaled(k), self.c2w)
+        return replace(self, intrinsics=self.intrinsics.scaled(k))
 
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the image at another size (see Intrinsics.resized)."""
-        return Camera(self.intrinsics.resized(width, height), self.c2w)
+        return replace(self, intrinsics=self.intrinsics.resized(width, height))
 
 
 def rigid_pose(c2w: ArrayLike) -> Float:

@@ -53,7 +53,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--lpips", action="store_true", help="also score LPIPS (VGG); needs nerfvol[lpips] and some seconds a view"
     )
-    p.add_argument("--truth", metavar="FILE.npz", help="the density.npz of a synthetic scene: also compare the density "
+    p.add_argument("--truth", metavar="FILE.npz", help="the density.npz or truth.npz of a synthetic scene: also compare "
+                   "the density, of media the albedo too "
                    "(with --save-images: slices of both)")  # fmt: skip
     add_drawing(p)
     p.add_argument("--cluster", metavar="WHERE", help="on the workers of an engine, which must see the data: "
@@ -149,20 +150,26 @@ def _on_cluster(
 
 def _compare_with_truth(target: Target, path: str, folder: str | None) -> dict[str, float]:
     from nerfvol.measure import truth
+    from nerfvol.medium.model import MediumModel
     from nerfvol.views import OctreeModel
 
-    if not isinstance(target.model, OctreeModel):
+    if not isinstance(target.model, OctreeModel | MediumModel):
         raise InputError(
             f"--truth compares densities, which {target.path}, a model of {target.model.kind}, does not have"
         )
-    grid = truth.load_grid(path)
-    scores = truth.compare(target.model.octree, grid)
+    if isinstance(target.model, MediumModel) and Path(path).name == truth.TRUTH:
+        scores = truth.compare_medium(target.model, *truth.load_medium(path))
+        print(f"albedo: mean error {scores['albedo_error']:.4f} (RGB, weighted by the true extinction)")
+    elif isinstance(target.model, MediumModel):
+        scores = truth.compare_medium(target.model, truth.load_grid(path))
+    else:
+        scores = truth.compare(target.model.octree, truth.load_grid(path))
     for name in ("density", "opacity"):
         print(
             f"{name}: relative L1 {scores[f'{name}_relative_l1']:.3f}, correlation {scores[f'{name}_correlation']:.4f}"
         )
-    if folder is not None:
-        truth.write_slices(Path(folder) / "density_slices.png", target.model.octree, grid)
+    if folder is not None and isinstance(target.model, OctreeModel):
+        truth.write_slices(Path(folder) / "density_slices.png", target.model.octree, truth.load_grid(path))
     return scores
 
 

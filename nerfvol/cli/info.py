@@ -67,7 +67,7 @@ def _print(record: dict[str, Any]) -> None:
         print(f"by resolution   {levels}")
         print(f"filled          {100 * stats['filled_share']:.3g} % of the root cube")
         print(f"density         {file['density']}, scale {file['density_scale']:g}")
-    for kind in ("splats", "points", "field"):
+    for kind in ("splats", "points", "field", "medium"):
         for key, value in record.get(kind, {}).items():
             print(f"{key.replace('_', ' '):15s} {f'{value:,}' if type(value) is int else json.dumps(value)}")
     print(f"nerfvol         {record['nerfvol']}")

@@ -42,6 +42,7 @@ class RenderOptions:
     output: Literal["rgb", "depth", "median_depth", "opacity", "normal"] = "rgb"
     aov: Annotated[tuple[str, ...], aov_names] = ()
     compare: str | None = None
+    light: str | None = None
     format: Literal["png", "exr"] = "png"
     fps: Annotated[float, above(0, 240)] | None = None
     background: Colour | None = None
@@ -71,6 +72,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     )
     p.add_argument("--output", metavar="rgb|depth|median_depth|opacity|normal", help="what is shown (default: rgb)")
     p.add_argument("--aov", metavar="LIST", help="also write depth,median_depth,opacity,normal")
+    p.add_argument("--light", metavar="NAME|FILE[:NAME]", help="for media: another light of the run's, or of a JSON file of "
+                   "lights (docs/relighting.md)")  # fmt: skip
     p.add_argument("--compare", metavar="RUN|FILE", help="a second model, to the right of the first")
     p.add_argument("--format", metavar="png|exr", help="exr: linear float, all AOVs in one file (default: png)")
     p.add_argument("--composite", metavar="surface|over", help="point clouds (.ply without scales): surface: points at one "
@@ -96,6 +99,11 @@ def run(options: RenderOptions) -> int:
 
     target = open_target(options.target, options.background)
     compared = open_target(options.compare, target.background) if options.compare else None
+    if options.light is not None and options.cluster is not None:
+        raise InputError("--light is not sent to the workers of --cluster: give one of them")
+    if options.light is not None:
+        target = _lit(target, options.light)
+        compared = None if compared is None else _lit(compared, options.light)
     if options.composite is not None:
         target = _composited(target, options.composite)
     cameras, fps = _cameras(options, target)
@@ -135,7 +143,8 @@ def run(options: RenderOptions) -> int:
         written = write_picture(out, film)
     else:
         chosen = _chosen(options, len(cameras))
-        drawn = write_pictures(out, film, options.format, chosen, each, identity(film, files, suffix=suffix))
+        of = identity(film, files, suffix=suffix, **({"light": options.light} if options.light else {}))
+        drawn = write_pictures(out, film, options.format, chosen, each, of)
     seconds = time.perf_counter() - started
     where = ", ".join(map(str, written))
     there = f", {len(cameras)} in the path" if drawn != len(cameras) else ""
@@ -214,6 +223,25 @@ def _cameras(options: RenderOptions, target: Target) -> tuple[list[Camera], floa
         count = max(1, round((path.seconds or 4.0) * fps))
     cameras = path.cameras if count is None else interpolated(path.cameras, count, options.loop or path.loop)
     return cameras, fps
+
+
+def _lit(target: Target, light: str) -> Target:
+    """The medium under another light; InputError for any other model."""
+    from nerfvol.medium.lighting import Lighting, load_lighting
+    from nerfvol.medium.model import MediumModel
+
+    model = target.model
+    if not isinstance(model, MediumModel):
+        raise InputError(f"--light is for media, {target.path} is a model of {model.kind}")
+    lighting, name = model.lighting, light
+    if light not in lighting.lights:
+        file, colon, name = light.rpartition(":") if not Path(light).exists() else (light, "", "")
+        if not Path(file).is_file():
+            known = ", ".join(list(lighting.lights)[:8])
+            raise InputError(f"--light {light}: expected one of the run's lights ({known}), or a JSON file of lights")
+        lighting = load_lighting(file)
+    chosen = lighting.of(name or None)
+    return replace(target, model=model.under(Lighting({light: chosen}, lighting.phase, lighting.exposure)))
 
 
 def _composited(target: Target, composite: Literal["surface", "over"]) -> Target:

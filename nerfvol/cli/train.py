@@ -25,9 +25,11 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
                    "previews/, checkpoint.safetensors")  # fmt: skip
     p.add_argument("--config", metavar="FILE", help="YAML file of settings, such as configs/smoke.yaml")
-    p.add_argument("--representation", metavar="auto|octree|splats|field", help="auto: splats on photographs, which they draw "
-                   "sharper and sooner; the octree, which has a density, on objects and media; field: a "
+    p.add_argument("--representation", metavar="auto|octree|splats|field|medium", help="auto: splats on photographs, which they "
+                   "draw sharper and sooner; the octree, which has a density, on objects and media; field: a "
                    "small network behind a hash grid, which the others can be made of (default: auto)")  # fmt: skip
+    p.add_argument("--light", metavar="FILE", help="JSON of the suns that the pictures were taken under and the phase function "
+                   "(docs/relighting.md): fits extinction and albedo of a medium, which can be lit anew")  # fmt: skip
     p.add_argument("--init", metavar="START", help="where it starts. octree: direct (low density everywhere) or mlp (a small "
                    "field, trained first and distilled, which auto takes for objects of few views); splats: points (of a "
                    "COLMAP model), sweep (of planes through the photographs), points+sweep, "
@@ -77,6 +79,8 @@ def run(given: dict[str, Any]) -> int:
     need("train", data=config.data, out=config.out)
     if not Path(config.data).exists():
         raise InputError(f"--data {config.data}: no such folder or file")
+    if config.light is not None and not Path(config.light).is_file():
+        raise InputError(f"--light {config.light}: no such file")
     config = with_poses(config)
     set_threads(config.threads)
     go_on_without_reader()

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from nerfvol.config.medium import MediumConfig
 from nerfvol.config.splats import SplatConfig
 from nerfvol.config.values import (
     Checked,
@@ -362,9 +363,12 @@ class Config(Checked):
     """Folder (or transforms JSON) of posed images."""
     out: str = ""
     """Run folder."""
-    representation: Literal["auto", "octree", "splats", "field"] = "auto"
+    representation: Literal["auto", "octree", "splats", "field", "medium"] = "auto"
     """What is trained. auto: splats on photographs, which are sharper and sooner so; the octree, which has a density, on
-    objects with a transparent background and on media. A field is a small network behind a hash grid."""
+    objects with a transparent background and on media. A field is a small network behind a hash grid. A medium, extinction
+    and albedo on a grid, is what ``light`` asks for."""
+    light: str | None = None
+    """File of what is known of the light (medium.lighting): a medium is fitted that can be lit anew."""
     init: str = "auto"
     """Where it starts. An octree: "mlp", a small field that is trained and distilled (auto: of objects with few training
     views), or "direct", low density everywhere (auto: of all else). A field: auto. Splats: "points" of a COLMAP model, "sweep"
@@ -414,17 +418,27 @@ class Config(Checked):
     """Section: the octree and its optimisation (OctreeConfig)."""
     splats: SplatConfig = dataclasses.field(default_factory=SplatConfig)
     """Section: Gaussian splats and their optimisation (config.splats)."""
+    medium: MediumConfig = dataclasses.field(default_factory=MediumConfig)
+    """Section: a medium under known light (config.medium)."""
 
     def check(self) -> None:
         """Raises InputError where ``init`` is no start of the representation; a resumed run needs its file no more."""
+        if self.light is not None and self.representation not in ("auto", "medium"):
+            raise InputError(
+                f"--light is what a medium is fitted under, expected no --representation {self.representation}"
+            )
+        if self.light is None and self.representation == "medium":
+            raise InputError("--representation medium needs --light FILE, what is known of the light")
         if self.resume:
             return
-        known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS, "field": ()}
+        known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS, "field": (), "medium": ()}
         names = known.get(self.representation, OCTREE_STARTS + SPLAT_STARTS)
-        is_file = self.representation not in ("octree", "field") and Path(self.init).exists()
+        is_file = self.representation not in ("octree", "field", "medium") and Path(self.init).exists()
         if self.init != "auto" and self.init not in names and not is_file:
             of = "" if self.representation == "auto" else f" for {self.representation}"
-            or_file = "" if self.representation in ("octree", "field") else " or a file of splats or an octree"
+            or_file = (
+                "" if self.representation in ("octree", "field", "medium") else " or a file of splats or an octree"
+            )
             raise InputError(f"init: expected {', '.join(('auto', *names))}{or_file}{of}, got {self.init!r}")
 
     def for_scene(self, scene: SceneBounds) -> Config:
@@ -440,8 +454,10 @@ class Config(Checked):
             )
         return dataclasses.replace(self, **sections, representation=suited)
 
-    def _suited(self, scene: SceneBounds) -> Literal["octree", "splats", "field"]:
-        """The representation as asked for, or the one that suits the start or the scene."""
+    def _suited(self, scene: SceneBounds) -> Literal["octree", "splats", "field", "medium"]:
+        """The representation as asked for, or the one that suits the light, the start or the scene."""
+        if self.light is not None:
+            return "medium"
         if self.representation != "auto":
             return self.representation
         if self.init == "auto":

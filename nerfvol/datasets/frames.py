@@ -179,7 +179,7 @@ def _view(frame: Frame, header: ImageHeader, source: Path) -> View:
     try:
         turns = header.orientation >= 5 and frame.calibration.turns(*header.size)
         size = header.upright if turns else header.size
-        camera = Camera(frame.calibration.intrinsics(*size), frame.c2w)
+        camera = Camera(frame.calibration.intrinsics(*size), frame.c2w, frame.light)
         reach = camera.intrinsics.seen()
         if reach is not None and reach.mean() < LEAST_REACH:
             width, height = size

@@ -94,7 +94,8 @@ class MaskFile:
 class Frame:
     """One listed image: as named by the file, where it is on disk (None if missing), its pose and calibration.
 
-    ``masks``: files that say which of its pixels count; none by default.
+    ``masks``: files that say which of its pixels count; none by default. ``light``: the name of the light it was taken under,
+    where the files tell several apart.
     """
 
     listed: str
@@ -102,6 +103,7 @@ class Frame:
     c2w: NDArray[np.float64]
     calibration: Calibration
     masks: tuple[MaskFile, ...] = ()
+    light: str | None = None
 
     @property
     def file(self) -> Path:

@@ -178,8 +178,9 @@ def _frame(
         raise InputError(f"{where}: {error}") from None
     if c2w is None:
         return None
-    path = finder.find(listed)
-    return Frame(listed, path, c2w, calibration, masks.of(listed, path, mask or None))
+    path, light = finder.find(listed), everything.get("light")
+    light = light if isinstance(light, str) and light else None
+    return Frame(listed, path, c2w, calibration, masks.of(listed, path, mask or None), light)
 
 
 _USED = {"frames", "file_path", "transform_matrix", "mask_path", "aabb", "aabb_scale", "ply_file_path",
@@ -189,10 +190,13 @@ _EMPTY = (None, "", [], {}, 0, 0.0, False)
 
 def _not_used(path: Path, data: Mapping[str, Any]) -> list[str]:
     """A sentence on what the file says and nothing here looks at. Keys that say nothing (zero, empty, null) do not count."""
-    top = sorted(key for key, value in data.items() if key not in _USED and value not in _EMPTY)
-    inside = {
-        key for entry in data["frames"] for key, value in entry.items() if key not in _USED and value not in _EMPTY
-    }
+
+    def unused(key: str, value: Any) -> bool:
+        named_light = key == "light" and isinstance(value, str)  # others' lights are no names
+        return key not in _USED and value not in _EMPTY and not named_light
+
+    top = sorted(key for key, value in data.items() if unused(key, value))
+    inside = {key for entry in data["frames"] for key, value in entry.items() if unused(key, value)}
     told = [*top, *(f"{key} (of frames)" for key in sorted(inside))]
     return [f"{path.name} states what is not used: {named(told, 8)}"] if told else []
 

@@ -11,7 +11,8 @@ CONFIG = "config.yaml"
 OCTREE = "octree.safetensors"
 SPLATS = "splats.safetensors"
 FIELD = "field.safetensors"
-PRODUCTS = (OCTREE, SPLATS, FIELD)
+MEDIUM = "medium.safetensors"
+PRODUCTS = (OCTREE, SPLATS, FIELD, MEDIUM)
 """Models that a finished run may hold."""
 CHECKPOINT = "checkpoint.safetensors"
 DISTILLED = "distilled.safetensors"

@@ -2,13 +2,15 @@
 
 Colour alone fixes the density only where light passes through: deep inside an opaque medium any density renders alike.
 So opacity along chords is reported next to it. Both are compared inside the box of the true grid alone: what is outside,
-such as the floor under a smoke, is no part of that truth, and an octree holds it as well.
+such as the floor under a smoke, is no part of that truth, and an octree holds it as well. A medium that was fitted under known
+light has an albedo as well, which the scene's truth.npz tells: `--truth truth.npz`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +23,13 @@ from nerfvol.octree.points import octree_density
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
 
+if TYPE_CHECKING:
+    from nerfvol.medium.model import MediumModel
+
 Float = NDArray[np.float64]
 CHORDS = 4096
+TRUTH = "truth.npz"
+"""All that a synthetic scene is made of (data_synth.truth)."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +60,14 @@ class Grid:
 
 
 def load_grid(path: str | Path) -> Grid:
-    """The grid in ``density.npz`` of a synthetic scene: arrays density, lo, hi, voxel_size.
+    """The grid in ``density.npz`` of a synthetic scene: arrays density, lo, hi, voxel_size; of a ``truth.npz`` that of its
+    first medium, with its green extinction.
 
     Raises:
         InputError: missing or unreadable file, or arrays that are no grid of finite, non-negative numbers.
     """
+    if Path(path).name == TRUTH:
+        return load_medium(path)[0]
     found = read_npz(path, ("density", "lo", "hi", "voxel_size"), "the density.npz of a synthetic scene")
     if not all(np.issubdtype(array.dtype, np.number) and np.isrealobj(array) for array in found.values()):
         raise InputError(f"{path}: expected the density.npz of a synthetic scene, but its arrays are no real numbers")
@@ -70,6 +80,28 @@ def load_grid(path: str | Path) -> Grid:
         )
     centred = np.allclose(voxel * sigma.shape, hi - lo, rtol=1e-4)  # samples at cell centres, else from face to face
     return Grid(sigma, lo + voxel / 2 if centred else lo, voxel, lo, hi)
+
+
+def load_medium(path: str | Path) -> tuple[Grid, Float]:
+    """Extinction and albedo (nx, ny, nz, 3), at its samples, of the first medium of a synthetic scene's truth.npz.
+
+    Raises:
+        InputError: missing or unreadable file, or its first medium is no grid.
+    """
+    names = ("kind", "density", "sigma_t", "albedo", "lo", "hi")
+    found = read_npz(
+        path, [f"medium0_{name}" for name in names], "the truth.npz of a synthetic scene with a grid of density"
+    )
+    kind, density, sigma_t, table, lo, hi = (found[f"medium0_{name}"] for name in names)
+    if str(kind) != "grid" or density.ndim != 3 or min(density.shape) < 2 or table.ndim != 2 or table.shape[1] != 3:
+        raise InputError(f"{path}: expected a scene whose first medium is a grid of density, it is {kind}")
+    albedo = np.broadcast_to(table[0], (*density.shape, 3)).astype(np.float64)
+    if len(table) > 1:
+        rows = read_npz(path, ["medium0_attribute"], "the truth.npz of a medium with an attribute")["medium0_attribute"]
+        place = np.clip(rows, 0, 1) * (len(table) - 1)
+        albedo = np.stack([np.interp(place, np.arange(len(table)), table[:, c]) for c in range(3)], -1)
+    voxel = (hi - lo) / (np.array(density.shape) - 1)
+    return Grid(density.astype(np.float64) * float(sigma_t[1]), lo, voxel, lo, hi), albedo
 
 
 def within_box(octree: Octree, lo: Float, hi: Float, side: float) -> Octree | None:
@@ -124,6 +156,26 @@ def compare(octree: Octree, grid: Grid, seed: int = 0) -> dict[str, float]:
         **_agreement("density", found, grid.sigma.reshape(-1)),
         **_agreement("opacity", opacity.astype(np.float64), -np.expm1(-depth)),
     }
+
+
+def compare_medium(model: MediumModel, grid: Grid, albedo: Float | None = None) -> dict[str, float]:
+    """What :func:`compare` returns, of a medium; with a true albedo at the grid's samples also the mean error of the albedo,
+    weighted by the true extinction: albedo_error."""
+    lo, hi = model.box
+    voxel = (hi - lo) / (np.array(model.sigma_t.shape) - 1)
+    recovered = Grid(model.sigma_t.astype(np.float64), lo, voxel, lo, hi)
+    index = np.stack(np.meshgrid(*map(np.arange, grid.sigma.shape), indexing="ij"), -1).reshape(-1, 3)
+    sigma, colour = model.at(grid.first + index * grid.voxel)
+    chords = list(zip(*random_chords(grid.lo, grid.hi), strict=True))
+    found, true = (np.array([_optical_depth(g, *chord) for chord in chords]) for g in (recovered, grid))
+    scores = _agreement("density", sigma, grid.sigma.reshape(-1)) | _agreement(
+        "opacity", -np.expm1(-found), -np.expm1(-true)
+    )
+    if albedo is not None:
+        weight = grid.sigma.reshape(-1)
+        error = np.abs(colour - albedo.reshape(-1, 3)).mean(1)
+        scores["albedo_error"] = float((weight * error).sum() / weight.sum())
+    return scores
 
 
 def _optical_depth(grid: Grid, start: Float, direction: Float, length: float) -> float:

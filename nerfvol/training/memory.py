@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfvol.config.medium import MediumConfig
 from nerfvol.config.splats import SplatConfig
 from nerfvol.config.training import Config, FieldConfig
 from nerfvol.datasets.dataset import Dataset
@@ -52,6 +53,10 @@ PHOTOGRAPH_LEAVES_PER_PIXEL = 0.8
 """The same for photographs, whose stages split less: 0.37 million for fox at 540x960."""
 MOST_LEAVES = 1 << 27
 """Eight corners each are numbered with 31 bits."""
+BYTES_PER_LIT_PIXEL = 28
+"""Per training pixel of a medium: a ray (six float32) and four bytes."""
+BYTES_PER_LIT_SAMPLE = 80
+"""Per step along a ray of a medium, looked up or not: position, thickness, transmittance, and what torch keeps of them."""
 SHARE = 0.9
 """Of the memory at hand that a run may plan for."""
 
@@ -239,6 +244,19 @@ def field_memory(dataset: Dataset, config: FieldConfig, held_out_bytes: int) -> 
     field = 4 * 4 * (entries + network) + 4 * config.grid_resolution**3 * (1 + dataset.scene.n_shells)
     peak = BASE_BYTES + images + field
     return f"{gib(peak)} at its peak: images {gib(images)}, the field {gib(field)}, the program {gib(BASE_BYTES)}"
+
+
+def medium_memory(dataset: Dataset, config: MediumConfig, held_out_bytes: int) -> str:
+    """The estimate of fitting a medium, in words."""
+    pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
+    images = dataset.nbytes + BYTES_PER_LIT_PIXEL * pixels + held_out_bytes
+    # Parameters, moments and gradients; sheared planes of up to four times as many vertices for each light
+    medium = 4 * max(config.resolutions) ** 3 * (16 + 24 * config.lights)
+    samples = BYTES_PER_LIT_SAMPLE * config.rays * round(2 * max(config.resolutions) / config.step_voxels)
+    torch = 300 << 20
+    peak = BASE_BYTES + torch + images + medium + samples
+    return (f"{gib(peak)} at its peak: images {gib(images)}, the medium {gib(medium)}, samples {gib(samples)}, the program "
+            f"{gib(BASE_BYTES + torch)}")  # fmt: skip
 
 
 class OctreePlan:

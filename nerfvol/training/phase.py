@@ -23,7 +23,7 @@ class Phase(Protocol):
 
     @property
     def name(self) -> str:
-        """One of ``field``, ``octree`` and ``splats``."""
+        """One of ``field``, ``octree``, ``splats`` and ``medium``."""
         ...
 
     @property

@@ -29,6 +29,7 @@ from nerfvol.kernels import ops
 from nerfvol.kernels.state import StepReport
 from nerfvol.machine import process_seconds, return_free_memory
 from nerfvol.measure.metrics import ssim
+from nerfvol.medium.model import MediumModel
 from nerfvol.models import Model
 from nerfvol.neural import FieldModel
 from nerfvol.training.compiled_field import compiled_refusal
@@ -48,7 +49,7 @@ RUNNING = 0.98
 """Memory, per step, of the running error."""
 
 
-PHASES = ("field", "octree", "splats", "done")
+PHASES = ("field", "octree", "splats", "medium", "done")
 _STATE = {
     "elapsed": float, "phase_started": float, "running": float, "log_bytes": int, "results": dict, "steps": dict,
     "trainer": dict,
@@ -329,6 +330,8 @@ class Run:
             return OctreeModel(frame.octree_back(model.octree), model.metadata)
         if isinstance(model, FieldModel):
             return FieldModel(model.field, model.metadata, frame.shift, frame.scale)
+        if isinstance(model, MediumModel):
+            return model.moved(frame.shift, frame.scale)
         if frame.is_identity or not isinstance(model, SplatModel):
             return model
         return SplatModel(frame.splats_back(model.splats), {**model.metadata, "near": model.near * frame.scale})

@@ -1,4 +1,5 @@
-"""The training run, from top to bottom: data, (field, distillation,) octree, or splats, or a field alone, scores.
+"""The training run, from top to bottom: data, (field, distillation,) octree, or splats, or a field or a medium alone,
+scores.
 
 Without a time budget a run is a fixed number of steps and no clock is read for anything but the log and the moments of
 checkpoints: the same seed gives the same bits, for any number of threads, stopped and resumed or not. With a budget,
@@ -18,7 +19,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -34,13 +35,15 @@ from nerfvol.files.lock import only_writer
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
 from nerfvol.measure.scores import COLOUR_MAPS, MEANS, evaluate, score_views
+from nerfvol.medium.lighting import load_lighting
 from nerfvol.models import Model, load_model
+from nerfvol.native import need_torch
 from nerfvol.octree.tree import Octree
 from nerfvol.starts.exposures import measure_exposures
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_start import make_field_trainer, make_final_trainer
-from nerfvol.training.memory import OctreePlan, field_memory, splat_memory
+from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
@@ -50,10 +53,16 @@ from nerfvol.training.session import RESERVE_SHARE, Clock, Run, Say, Watch, read
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
-PRODUCT = {"octree": run_folder.OCTREE, "splats": run_folder.SPLATS, "field": run_folder.FIELD}
+if TYPE_CHECKING:
+    from nerfvol.training.medium_trainer import MediumTrainer
+
+PRODUCT = {
+    "octree": run_folder.OCTREE, "splats": run_folder.SPLATS, "field": run_folder.FIELD, "medium": run_folder.MEDIUM,
+}  # fmt: skip
 WHY = {
     "octree": "an object without surroundings, or asked for by --init",
     "splats": "photographs, which splats draw sharper and sooner, or asked for by --init",
+    "medium": "--light tells the light",
 }
 MakeBar = Callable[[str, float], Any]
 """A phase's name and what is done of it, 0 to 1 -> a bar with tqdm's ``update`` and ``set_postfix_str``."""
@@ -126,7 +135,10 @@ def _train(
     run = Run(config, data, clock, saved, say)
     run.watch = watch
     with run.interruptible(), run:
-        begin = {"octree": begin_octree, "splats": begin_splats, "field": begin_field}
+        if run.config.light is None and len({camera.light for camera in data.training.cameras}) > 1:
+            run.say("the views are taken under several lights, of which one picture is made: --light FILE fits a medium that "
+                    "can be lit anew")  # fmt: skip
+        begin = {"octree": begin_octree, "splats": begin_splats, "field": begin_field, "medium": begin_medium}
         phase: FinalPhase = begin[run.config.representation](run)
         optimise(run, phase, bar)
         appearance = phase.appearance
@@ -160,6 +172,21 @@ def begin_field(run: Run) -> CompiledFieldTrainer:
     config, dataset = run.config, run.data.training
     announce(run, field_memory(dataset, config.field, run.data.held_out_bytes))
     return make_final_trainer(dataset, config.field, config.seed, run.background)
+
+
+def begin_medium(run: Run) -> MediumTrainer:
+    """The trainer of a medium under known light."""
+    need_torch("--representation medium")
+    from nerfvol.training.medium_trainer import MediumTrainer
+
+    config, dataset = run.config, run.data.training
+    if dataset.scene.is_unbounded:
+        raise InputError(
+            "--light fits a medium alone: expected pictures with a transparent background, not surroundings"
+        )
+    lighting = load_lighting(config.light or "")
+    announce(run, medium_memory(dataset, config.medium, run.data.held_out_bytes))
+    return MediumTrainer(dataset, lighting, config.medium, config.seed, run.background)
 
 
 def begin_splats(run: Run) -> SplatTrainer:

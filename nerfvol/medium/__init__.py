@@ -1,0 +1,1 @@
+"""A participating medium: extinction and albedo on a grid, lit by known suns, so that it can be lit anew."""
