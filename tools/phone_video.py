@@ -1,13 +1,14 @@
 """A video as a phone takes it, with the truth of where it was: to measure `nerfvol capture` with.
 
-    python tools/phone_video.py make walk.mp4 [--seconds 60] [--size 1920x1080] [--rate 30] [--rendered 10]
+    python tools/phone_video.py make walk.mp4 [--seconds 60] [--size 1920x1080] [--rate 24]
     nerfvol capture walk.mp4 --out run
     python tools/phone_video.py check walk.json run/scene
 
-A room of coloured tiles with a table, drawn by this package's splats, along a walk around the table: steps, a trembling
-hand, rows read one after the other (20 ms), exposed for 10 ms, noise, exposure that drifts by 10 %. ``--rendered`` frames a
-second are drawn, the video repeats them up to ``--rate``. ``check`` aligns the cameras found with the walk by a similarity
-and prints their errors in per cent of the length of the path.
+A furnished room (tools/phone_room.py) along a walk around its table: steps, a trembling hand, rows read one after the other
+(20 ms), each exposed for 10 ms, a lens that bends, exposure that drifts by 10 %, noise, x264. Every row of every frame is cast
+from where the camera was when it was read. What is drawn has half the size and is enlarged: as soft as a phone's video, whose
+full size is not its resolution. A minute costs ten minutes of one core. ``check`` aligns the cameras found with the walk by a
+similarity and prints their errors in per cent of the length of the path.
 """
 
 from __future__ import annotations
@@ -21,108 +22,70 @@ from pathlib import Path
 
 import numpy as np
 
-from nerfvol.cameras.camera import Camera, Intrinsics, look_at
+from nerfvol.cameras.camera import Camera
 from nerfvol.datasets.load import load_dataset
-from nerfvol.rotations import rotation_of, turning_z_to
-from nerfvol.splats.splats import Splats
-from nerfvol.views import SplatModel
 
-HALF = np.array([2.0, 1.5, 1.2])
-TABLE = np.array([[-0.4, -0.35, -1.2], [0.4, 0.35, -0.5]])
-TILE, SPACING = 0.08, 0.03
-READOUT, EXPOSURE, PARTS = 0.02, 0.01, 4
-NOISE, DRIFT = 3.0, 0.1
-Y0 = 0.28209479177387814
-
-
-def faces(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (n, 3) on the faces of a box and their axes (n, 3)."""
-    places, normals = [], []
-    for axis in range(3):
-        a, b = (k for k in range(3) if k != axis)
-        u, v = np.meshgrid(*(np.arange(low[k] + SPACING / 2, high[k], SPACING) for k in (a, b)), indexing="ij")
-        for side in (low[axis], high[axis]):
-            points = np.empty((u.size, 3))
-            points[:, a], points[:, b], points[:, axis] = u.ravel(), v.ravel(), side
-            places.append(points)
-            normals.append(np.tile(np.eye(3)[axis], (u.size, 1)))
-    return np.concatenate(places), np.concatenate(normals)
-
-
-def room() -> SplatModel:
-    """Walls and a table as discs, their colours those of tiles, no two tiles alike."""
-    parts = [faces(-HALF, HALF), faces(*TABLE)]
-    places, normals = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    cell = np.floor((places - 1e-3 * places) / TILE).astype(np.int64)
-    _, which = np.unique(cell, axis=0, return_inverse=True)
-    colours = np.random.default_rng(0).uniform(0.08, 0.8, (which.max() + 1, 3))[which.ravel()]
-    scales = np.tile([0.55 * SPACING, 0.55 * SPACING, 1e-3], (len(places), 1))
-    sh = ((colours - 0.5) / Y0)[:, :, None]
-    logits, quats = np.full(len(places), 4.0), turning_z_to(normals)
-    places, scales, quats, logits, sh = (part.astype(np.float32) for part in (places, scales, quats, logits, sh))
-    splats = Splats(places, np.log(scales), quats, logits, sh, np.zeros(3), "mip")
-    return SplatModel(splats, {"near": 0.05})
+READOUT, EXPOSURE, SAMPLES = 0.02, 0.01, 4
+FOCAL, BEND = 0.78, 0.03
+"""Focal length in widths; the ray of a pixel at radius r goes through r (1 + BEND r^2), in focal lengths."""
+NOISE, DRIFT = 4.0, 0.1
+"""Standard deviation in levels of what is drawn; share of the exposure."""
 
 
 def hand(seconds: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places (n, 3) and viewing directions (n, 3) of the walk at these times."""
+    """Places (n, 3) and rotations (n, 3, 3: right, up, back as columns) of the walk at these times."""
     t = np.asarray(seconds, np.float64)
     angle = 2 * np.pi * 0.85 * t / duration
     eyes = np.stack([1.5 * np.cos(angle), 1.05 * np.sin(angle), 0.2 + 0.15 * np.sin(3 * angle)], 1)
     eyes[:, 2] += 0.012 * np.sin(2 * np.pi * 1.8 * t)  # steps
     eyes[:, :2] += 0.008 * np.stack([np.sin(2 * np.pi * 0.9 * t), np.cos(2 * np.pi * 0.7 * t)], 1)
-    at = np.stack([0.1 * np.sin(5 * angle), 0.1 * np.cos(4 * angle), np.full(len(t), -0.6)], 1)
-    forward = at - eyes
-    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    at = np.stack([0.1 * np.sin(5 * angle), 0.1 * np.cos(4 * angle), np.full(len(t), -0.45)], 1)
+    back = eyes - at
     tremor = 0.004 * np.stack([np.sin(2 * np.pi * f * t + f) for f in (3.1, 4.3, 5.7)], 1)
-    return eyes, np.stack([rotation_of(w) @ d for w, d in zip(tremor, forward, strict=True)])
-
-
-def camera_at(t: float, duration: float, lens: Intrinsics) -> Camera:
-    """The camera at one moment."""
-    eye, forward = (a[0] for a in hand(np.array([t]), duration))
-    return Camera(lens, look_at(eye, eye + forward))
-
-
-def frame(model: SplatModel, t: float, duration: float, lens: Intrinsics, rng: np.random.Generator) -> np.ndarray:
-    """(h, w, 3) uint8: row r is exposed from t + r / h READOUT for EXPOSURE; pictures between the moments drawn are mixed."""
-    moments = np.linspace(0, READOUT + EXPOSURE, PARTS)
-    start = READOUT * (np.arange(lens.height) + 0.5) / lens.height
-    step = moments[1]
-    out = np.zeros((lens.height, lens.width, 3), np.float32)
-    for moment in moments:
-        # Of a hat function around the moment, what the row's exposure sees, by midpoints.
-        seen = (
-            np.stack([1 - np.abs(start + EXPOSURE * (k + 0.5) / 8 - moment) / step for k in range(8)]).clip(0).mean(0)
-        )
-        if seen.any():
-            rgb = model.render(camera_at(t + moment, duration, lens), (0, 0, 0))["rgb"]
-            out += seen[:, None, None].astype(np.float32) * rgb
-    gain = 1 + DRIFT * np.sin(2 * np.pi * t / 23)
-    noise = rng.normal(0, NOISE, out.shape[:2] + (3,)).astype(np.float32)
-    return np.clip(255 * gain * out + noise + 0.5, 0, 255).astype(np.uint8)
+    back = back / np.linalg.norm(back, axis=1, keepdims=True)
+    back = back + np.cross(tremor, back)
+    back /= np.linalg.norm(back, axis=1, keepdims=True)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    up = np.cross(back, right)
+    roll = 0.01 * np.sin(2 * np.pi * 0.45 * t)[:, None]
+    right, up = np.cos(roll) * right + np.sin(roll) * up, np.cos(roll) * up - np.sin(roll) * right
+    return eyes, np.stack([right, up, back], 2)
 
 
 def make(args: argparse.Namespace) -> None:
-    """Writes the video and, beside it, ``.json`` with the camera in the middle of each frame drawn."""
+    """Writes the video and, beside it, ``.json`` with the camera in the middle of each frame."""
     import imageio_ffmpeg
+    from phone_room import draw, furnish
 
     width, height = map(int, args.size.split("x"))
-    lens = Intrinsics(width, height, 0.78 * width, 0.78 * width, width / 2, height / 2)
-    model, rng, poses = room(), np.random.default_rng(1), []
+    drawn = (width // 2, height // 2)
+    room, rng = furnish(), np.random.default_rng(1)
+    grain = rng.normal(0, NOISE, (2 * drawn[1], 2 * drawn[0], 3)).astype(np.float32)  # a part of it for each frame
+    rows = READOUT * (np.arange(drawn[1]) + 0.5) / drawn[1]
+    moments = (rows[:, None] + EXPOSURE * (np.arange(SAMPLES) + 0.5) / SAMPLES).ravel()
+    times = np.arange(round(args.seconds * args.rate)) / args.rate
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-        "-s", f"{width}x{height}", "-r", str(args.rendered), "-i", "-", "-r", str(args.rate), "-c:v", "libx264",
-        "-preset", "ultrafast", "-crf", "20", "-pix_fmt", "yuv420p", args.video,
+        "-s", f"{drawn[0]}x{drawn[1]}", "-r", str(args.rate), "-i", "-", "-vf", f"scale={width}:{height}:flags=bicubic",
+        "-c:v", "libx264", "-preset", "ultrafast", "-crf", "20", "-threads", "1", "-pix_fmt", "yuv420p", args.video,
     ]  # fmt: skip
     with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
         assert process.stdin is not None
-        for k in range(round(args.seconds * args.rendered)):
-            t = k / args.rendered
-            process.stdin.write(frame(model, t, args.seconds, lens, rng).tobytes())
-            poses.append(camera_at(t + (READOUT + EXPOSURE) / 2, args.seconds, lens).c2w.tolist())
-    truth = {"rate": args.rate, "rendered": args.rendered, "poses": poses, "focal": lens.fx / width}
-    Path(args.video).with_suffix(".json").write_text(json.dumps(truth))
+        for t in times:
+            eyes, turns = hand(t + moments, args.seconds)
+            shape = (drawn[1], SAMPLES)
+            light = draw(
+                room, eyes.reshape(*shape, 3), turns.reshape(*shape, 3, 3), drawn, FOCAL * drawn[0], BEND
+            ).clip(0)
+            light *= 1.6 * (1 + DRIFT * np.sin(2 * np.pi * t / 23))
+            x, y = rng.integers(drawn[0]), rng.integers(drawn[1])
+            levels = 255 * light ** np.float32(1 / 2.2) + grain[y : y + drawn[1], x : x + drawn[0]] + 0.5
+            process.stdin.write(np.clip(levels, 0, 255).astype(np.uint8).tobytes())
+    eyes, turns = hand(times + (READOUT + EXPOSURE) / 2, args.seconds)
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = turns, eyes
+    Path(args.video).with_suffix(".json").write_text(json.dumps({"rate": args.rate, "poses": poses.tolist()}))
 
 
 def check(args: argparse.Namespace) -> int:
@@ -131,7 +94,7 @@ def check(args: argparse.Namespace) -> int:
     poses = np.array(truth["poses"])
     path = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
     views = [v for split in ("train", "val") for v in _named(load_dataset(args.scene, split, 8))]
-    numbers = [int(int(re.findall(r"\d+", name)[-1]) * truth["rendered"] / truth["rate"]) for name, _ in views]
+    numbers = [int(re.findall(r"\d+", name)[-1]) for name, _ in views]
     wanted, found = poses[numbers], np.stack([camera.c2w for _, camera in views])
     a, b = wanted[:, :3, 3], found[:, :3, 3]
     u, s, vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
@@ -159,8 +122,7 @@ def main() -> int:
     one.add_argument("video")
     one.add_argument("--seconds", type=float, default=60)
     one.add_argument("--size", default="1920x1080")
-    one.add_argument("--rate", type=int, default=30)
-    one.add_argument("--rendered", type=int, default=10)
+    one.add_argument("--rate", type=int, default=24)
     one.set_defaults(run=make)
     two = commands.add_parser("check")
     two.add_argument("truth")

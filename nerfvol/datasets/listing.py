@@ -229,8 +229,13 @@ def _beside(path: Path) -> tuple[str, str, str]:
 
 def is_photograph(path: Path) -> bool:
     """Whether a file's name is a photograph's: a known suffix, no leftover of an operating system (``._a.jpg``), no mask."""
+    return path.suffix.lower() in SUFFIXES and not is_left_aside(path)
+
+
+def is_left_aside(path: Path) -> bool:
+    """Whether a file's name says that it is no photograph whatever its suffix: hidden, or a mask."""
     is_mask = path.name.startswith("dynamic_mask_") or path.stem.endswith((".mask", "_mask"))
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not is_mask
+    return path.name.startswith(".") or is_mask
 
 
 class ImageFinder:

@@ -11,6 +11,7 @@ loss: 255 where the photograph shows it, 0 in padding and outside, between for m
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -47,6 +48,10 @@ class Photographs:
 
     Full-size canvases of distorted photographs are made at once; levels when they are asked for, and kept until
     :meth:`drop`. Photographs without distortion cost nothing until then, and their full size is the dataset's own memory.
+
+    ``most_bytes`` bounds what is kept next to the dataset's images: what comes when it is full is made again whenever it is
+    asked for, the same bits. Views are visited in an order of chance, each once in an epoch: no rule of what to throw out
+    would hit more often than keeping those that came first.
     """
 
     def __init__(
@@ -56,9 +61,11 @@ class Photographs:
         alpha: Literal["background", "mask"] = "background",
         max_angle: float = MAX_ANGLE,
         threads: int | None = None,
+        most_bytes: int | None = None,
     ) -> None:
         """``alpha``: images with transparency are composited over ``background`` (objects), or it is the loss's weight
-        (masked photographs). ``max_angle``: radians to each side of the axis, the widest a canvas is.
+        (masked photographs). ``max_angle``: radians to each side of the axis, the widest a canvas is. ``most_bytes``: None for
+        no bound.
 
         Raises:
             InputError: the lens of a view cannot be undone.
@@ -71,8 +78,10 @@ class Photographs:
         grids = {lens: source_grid(canvas, lens) for lens, canvas in canvases.items() if not is_pinhole(lens)}
         over = background if alpha == "background" else None
 
+        images: list[UInt8] = list(dataset.images)
+
         def make(i: int) -> UInt8:
-            lens, image = dataset.cameras[i].intrinsics, dataset.images[i]
+            lens, image = dataset.cameras[i].intrinsics, images[i]
             if over is not None and image.shape[2] == 4:
                 image = composite_average(image, over, 1)
             if (mask := dataset.mask(i)) is not None:
@@ -80,7 +89,10 @@ class Photographs:
                 image = np.concatenate([image[..., :3], np.minimum(mask, own)[..., None]], axis=2)
             return undistorted(image, canvases[lens], *grids[lens]) if lens in grids else image
 
-        self._sources = map_threads(make, range(len(dataset)), self._threads)
+        self._make_source, self._images, self._most, self._lock = make, images, most_bytes, threading.Lock()
+        self._sources: list[UInt8 | None] = [None] * len(dataset)
+        self._bytes, self._full = 0, False
+        map_threads(lambda i: None if self._full else self._source(i), range(len(dataset)), self._threads)
         wide = [c.intrinsics for c in dataset.cameras if canvases[c.intrinsics].cropped]
         if wide:
             self.messages.append(
@@ -92,24 +104,38 @@ class Photographs:
         return len(self.cameras)
 
     @property
+    def most_bytes(self) -> int | None:
+        """The bound on :attr:`nbytes`; None: there is none."""
+        return self._most
+
+    @property
     def nbytes(self) -> int:
-        """Bytes of all images held now."""
-        held = {id(image): image.nbytes for image in self._sources}
+        """Bytes of all images held now, next to the dataset's own."""
+        held = {id(image): image.nbytes for image in self._sources if image is not None}
         held |= {id(view.image): view.image.nbytes for level in self._levels.values() for view in level.values()}
-        return sum(held.values())
+        return sum(held[which] for which in held.keys() - {id(image) for image in self._images})
 
     @property
     def held(self) -> set[int]:
         """The factors of which images are held now."""
-        return set(self._levels)
+        return {factor for factor, views in self._levels.items() if views}
 
     def view(self, i: int, factor: int) -> TrainingView:
-        """View i at 1 / factor of its size, made where it is not yet; a power of two up to 64."""
+        """View i at 1 / factor of its size, made where it is not kept; a power of two up to 64."""
         check_factor(factor)
-        level = self._levels.setdefault(factor, {})
-        if i not in level:
-            level[i] = self._make(i, factor)
-        return level[i]
+        kept = self._levels.setdefault(factor, {}).get(i)
+        if kept is not None:
+            return kept
+        source = self._source(i)
+        view = self._make(i, factor, source)
+        own = factor == 1 and source is self._sources[i] and source is not self._images[i]
+        if (
+            view.image is self._sources[i]
+            or (own and self._in_place(i, source, view.image))
+            or self._room(view.image.nbytes)
+        ):
+            self._levels[factor][i] = view
+        return view
 
     def level(self, factor: int) -> list[TrainingView]:
         """All views at 1 / factor of their size."""
@@ -117,17 +143,40 @@ class Photographs:
 
     def drop(self, factor: int) -> None:
         """Release a level's images; full-size canvases stay, since the others are made from them."""
-        self._levels.pop(factor, None)
+        for i, view in self._levels.pop(factor, {}).items():
+            if view.image is not self._sources[i]:
+                self._bytes -= view.image.nbytes
 
-    def _make(self, i: int, factor: int) -> TrainingView:
-        camera, source = self.cameras[i], self._sources[i]
+    def _room(self, more: int) -> bool:
+        """Whether ``more`` bytes may be kept; they are counted then."""
+        with self._lock:
+            fits = self._most is None or self._bytes + more <= self._most
+            self._bytes += more if fits else 0
+            self._full |= not fits
+        return fits
+
+    def _source(self, i: int) -> UInt8:
+        """Photograph i at its full size, what is made of the dataset's image kept where there is room."""
+        if (kept := self._sources[i]) is not None:
+            return kept
+        source = self._make_source(i)
+        if source is self._images[i] or self._room(source.nbytes):
+            self._sources[i] = source
+        return source
+
+    def _in_place(self, i: int, source: UInt8, padded: UInt8) -> bool:
+        """Whether the padded copy takes the place of the source that it was made from, and of its bytes."""
+        if not self._room(padded.nbytes - source.nbytes):
+            return False
+        self._sources[i] = padded
+        return True
+
+    def _make(self, i: int, factor: int, source: UInt8) -> TrainingView:
+        camera = self.cameras[i]
         lens = level_camera(camera.intrinsics, factor)
         width, height = (-(-n // factor) for n in (camera.intrinsics.width, camera.intrinsics.height))
         size = (lens.height, lens.width)
-        if factor == 1 and source.shape != (*size, 4):
-            # The padded copy takes the place of what it was made from.
-            source = self._sources[i] = reduce(source, 1, size)
-        image = source if factor == 1 else reduce(source, factor, size)
+        image = source if factor == 1 and source.shape == (*size, 4) else reduce(source, factor, size)
         return TrainingView(image, replace(camera, intrinsics=lens), width, height)
 
 
@@ -154,7 +203,8 @@ def undistorted(image: UInt8, canvas: Canvas, grid: Float, step: int) -> UInt8:
 
 
 def estimate_bytes(cameras: Sequence[Camera], factors: Sequence[int] = FACTORS, max_angle: float = MAX_ANGLE) -> int:
-    """Bytes that :class:`Photographs` of these cameras holds once all views of the levels ``factors`` are made."""
+    """Bytes that :class:`Photographs` of these cameras would hold, next to the dataset's images, once all views of the levels
+    ``factors`` are made."""
     total = 0
     for camera in cameras:
         canvas = canvas_of(camera.intrinsics, max_angle).camera

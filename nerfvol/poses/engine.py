@@ -43,7 +43,8 @@ GOOD_PAIR = 20
 @dataclass(frozen=True)
 class Job:
     """What is asked of the engine. ``groups``: each with names, width, height, model, focal, known. ``octave``: 0, or -1 to
-    look for features in a picture of twice the size. ``mapper``: auto, global or incremental."""
+    look for features in a picture of twice the size. ``mapper``: auto, global or incremental. ``masks``: folder of NAME.png,
+    black where photograph NAME has no features; "" for none."""
 
     images: str
     work: str
@@ -53,6 +54,7 @@ class Job:
     threads: int = 0
     seed: int = 0
     mapper: str = "auto"
+    masks: str = ""
 
     @property
     def names(self) -> list[str]:
@@ -154,17 +156,25 @@ def extract(job: Job, report: Report) -> None:
     done, all_names = len(there), job.names
     report("features", done, len(all_names))
     for number, group in enumerate(job.groups, 1):
-        reader = pycolmap.ImageReaderOptions()
-        reader.existing_camera_id = number
         missing = [name for name in sorted(group["names"]) if name not in there]
-        for first in range(0, len(missing), AT_ONCE):
-            few = missing[first : first + AT_ONCE]
-            pycolmap.extract_features(
-                path, job.images, few, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
-                extraction_options=options,
-            )  # fmt: skip
-            done += len(few)
-            report("features", done, len(all_names))
+        for masked in (False, True):  # a reader with masks refuses pictures that have none
+            reader = pycolmap.ImageReaderOptions()
+            reader.existing_camera_id = number
+            if masked:
+                reader.mask_path = job.masks
+            names = [name for name in missing if _has_mask(job, name) == masked]
+            for first in range(0, len(names), AT_ONCE):
+                few = names[first : first + AT_ONCE]
+                pycolmap.extract_features(
+                    path, job.images, few, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+                    extraction_options=options,
+                )  # fmt: skip
+                done += len(few)
+                report("features", done, len(all_names))
+
+
+def _has_mask(job: Job, name: str) -> bool:
+    return bool(job.masks) and (Path(job.masks) / f"{name}.png").is_file()
 
 
 def match(job: Job, report: Report, left_out: Sequence[str] = ()) -> str:

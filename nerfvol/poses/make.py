@@ -23,9 +23,10 @@ from nerfvol.measure.sharpness import sharpness
 from nerfvol.poses import sources, video
 from nerfvol.poses.child import Progress, require_pycolmap, run_engine
 from nerfvol.poses.engine import MODEL, PLACED, Job
+from nerfvol.poses.masks import copy_masks, find_masks
 from nerfvol.poses.verdict import failure, remarks
 
-WORK, IMAGES, REPORT = "poses_work", "images", "poses.json"
+WORK, IMAGES, MASKS, REPORT = "poses_work", "images", "masks", "poses.json"
 DETAILED = 150_000
 """Pixels above which features are looked for in the picture itself; below, in one of twice the size."""
 Say = Callable[[str], object]
@@ -106,6 +107,7 @@ def make_poses(
         job = Job(
             str((folder / IMAGES).resolve()), str(work.resolve()), [asdict(group) for group in groups],
             settings.features, -1 if small else 0, settings.threads, settings.seed, settings.mapper,
+            str((folder / MASKS).resolve()) if (folder / MASKS).is_dir() else "",
         )  # fmt: skip
         result = engine(job, bar)
     names = job.names
@@ -150,6 +152,7 @@ def gather(
         paths = sources.find_photographs(path)
         photographs, bad = sources.copy_photographs(paths, images, settings.size)
         bad += sources.left_out(paths)
+        bad += copy_masks(find_masks(path, paths), paths[0].parent, photographs, images.parent / MASKS)
         some = (
             [photographs[i] for i in np.unique(np.linspace(0, len(photographs) - 1, 16).round().astype(int))]
             if photographs
@@ -191,10 +194,13 @@ def finished(folder: Path, mark: dict[str, Any] | None = None) -> dict[str, Any]
 def _mark(path: Path, settings: PoseSettings) -> dict[str, Any]:
     """What a result depends on: the files by name, size and time of change, and the settings."""
     files = [path] if path.is_file() else sources.find_photographs(path)
+    n = len(files)
+    masks = {} if path.is_file() else find_masks(path, files)
+    files += [mask.path for found in masks.values() for mask in found]
     seen = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     digest = hashlib.sha256(json.dumps(seen).encode()).hexdigest()[:16]
     settled = {key: value for key, value in asdict(settings).items() if key != "threads"}
-    return {"source": str(path.resolve()), "files": len(files), "digest": digest, "settings": settled}
+    return {"source": str(path.resolve()), "files": n, "digest": digest, "settings": settled}
 
 
 def _publish(work: Path, folder: Path) -> None:

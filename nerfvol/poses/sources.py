@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from nerfvol.datasets.images import MAX_PIXELS, SUFFIXES, map_threads
+from nerfvol.datasets.listing import is_left_aside
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write
 
@@ -35,13 +36,15 @@ HEIF_SUFFIXES = (".heic", ".heif")
 @dataclass(frozen=True)
 class Photograph:
     """A picture as structure from motion sees it. ``name``: of the copy. ``width``, ``height``: of the copy, pixels.
-    ``camera``: what its EXIF says took it, "" where it says nothing. ``focal``: focal length in pixels of the copy, or None."""
+    ``camera``: what its EXIF says took it, "" where it says nothing. ``focal``: focal length in pixels of the copy, or None.
+    ``source``: name of the file it is a copy of."""
 
     name: str
     width: int
     height: int
     camera: str = ""
     focal: float | None = None
+    source: str = ""
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def reads_heif() -> bool:
 def find_photographs(folder: Path) -> list[Path]:
     """The picture files of a folder, in the order of their names; InputError where there are fewer than three."""
     try:
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        files = sorted(path for path in folder.iterdir() if path.is_file() and not is_left_aside(path))
     except OSError as error:
         raise InputError(f"{folder}: expected a folder of photographs or a video, but it cannot be read") from error
     heif = [path for path in files if path.suffix.lower() in HEIF_SUFFIXES]
@@ -160,7 +163,7 @@ def _copy(path: Path, folder: Path, name: str, size: int) -> Photograph:
             with atomic_write(target) as temporary:
                 upright.resize((width, height), Image.Resampling.LANCZOS).save(temporary, format="JPEG", quality=96)
     focal = None if focal_35 is None else focal_35 * math.hypot(width, height) / FILM_DIAGONAL
-    return Photograph(target.name, width, height, camera, focal)
+    return Photograph(target.name, width, height, camera, focal, path.name)
 
 
 def _camera_of(exif: Image.Exif) -> tuple[str, float | None]:

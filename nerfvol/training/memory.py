@@ -215,18 +215,46 @@ SPLAT_BYTES = 3 * 4 + 84 + 6 * 81
 """Per Gaussian, next to its parameters and moments: statistics, a record, and gradients of six tiles (mostly 4 to 8)."""
 
 
-def splat_memory(photographs: Photographs, schedule: Schedule, config: SplatConfig, held_out_bytes: int) -> str:
-    """The estimate of training ``schedule.most`` splats, in words; InputError where that does not fit in the memory at hand."""
-    images = estimate_bytes(photographs.cameras, schedule.factors) + held_out_bytes
+PHOTOGRAPHS_SHARE = 0.5
+"""Of the memory at hand that sizes and canvases of photographs may take; what is beyond is made again when it is needed."""
+
+
+def photographs_bytes(available: int | None = None) -> int | None:
+    """Most bytes that a run's photographs may keep next to the images that were read; None where nobody tells.
+
+    ``available``: bytes; by default what the machine has free.
+    """
+    free = available_memory() if available is None else available
+    return None if free is None else int(PHOTOGRAPHS_SHARE * free)
+
+
+def photographs_held(dataset: Dataset, photographs: Photographs, factors: Sequence[int]) -> tuple[int, float]:
+    """Bytes of the images of ``dataset`` and of all that ``photographs`` come to keep of them at the sizes 1 / ``factors``; and
+    the share of what would be kept without their bound."""
+    wanted, most = estimate_bytes(photographs.cameras, factors), photographs.most_bytes
+    kept = wanted if most is None else min(wanted, most)
+    return dataset.nbytes + kept, kept / wanted
+
+
+def splat_memory(
+    dataset: Dataset, photographs: Photographs, schedule: Schedule, config: SplatConfig, held_out_bytes: int
+) -> str:
+    """The estimate of training ``schedule.most`` splats, in words; InputError where that does not fit in the memory at hand.
+
+    The images of ``dataset`` and what ``photographs`` hold are there already.
+    """
+    held, kept = photographs_held(dataset, photographs, schedule.factors)
+    images = held + held_out_bytes
     row = 4 * (11 + 3 * ((config.sh_degree or 0) + 1) ** 2)
     splats = schedule.most * (4 * row + SPLAT_BYTES)
     peak = BASE_BYTES + images + splats
+    part = "" if kept == 1 else f" ({kept:.0%} of the sizes; the others are made again for each step)"
     sentence = (
-        f"{gib(peak)} at its peak: photographs at {len(schedule.factors)} sizes {gib(images)}, up to {schedule.most:,} splats "
-        f"{gib(splats)}, the program {gib(BASE_BYTES)}"
+        f"{gib(peak)} at its peak: photographs and {len(schedule.factors)} sizes of them {gib(images)}{part}, up to "
+        f"{schedule.most:,} splats {gib(splats)}, the program {gib(BASE_BYTES)}"
     )
-    free = available_memory()
-    if free is not None and peak > SHARE * free:
+    free, more = available_memory(), peak - dataset.nbytes - held_out_bytes - photographs.nbytes
+    if free is not None and more > SHARE * free:
         raise InputError(
             f"training would need {sentence}, but {gib(free)} of memory are free; use a larger --downscale or fewer splats "
             "(--set splats.max_splats=N)"

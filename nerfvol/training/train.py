@@ -43,7 +43,7 @@ from nerfvol.starts.exposures import measure_exposures
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_start import make_field_trainer, make_final_trainer
-from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, splat_memory
+from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, photographs_bytes, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
@@ -194,11 +194,11 @@ def begin_splats(run: Run) -> SplatTrainer:
     from nerfvol.training.splat_start import make_schedule_of, start_splats
 
     config, dataset = run.config, run.data.training
-    photographs = Photographs(dataset, run.background)
+    photographs = Photographs(dataset, run.background, most_bytes=photographs_bytes())
     for message in photographs.messages:
         run.say(message)
     schedule = make_schedule_of(run, photographs)
-    announce(run, splat_memory(photographs, schedule, config.splats, run.data.held_out_bytes))
+    announce(run, splat_memory(dataset, photographs, schedule, config.splats, run.data.held_out_bytes))
     splats, distance = start_splats(run, photographs, schedule.most)
     return SplatTrainer(
         photographs, splats, config.splats, schedule, distance, run.background, config.seed, appearance_of(run, photographs),

@@ -185,6 +185,31 @@ def test_bytes_are_what_the_estimate_says():
     assert level_camera(PINHOLE, 8).width == 16
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize(
+    "lens,alpha,n", [(Intrinsics(24, 14, 20.0, 20.0, 12.0, 7.0), False, 150), (BARREL, False, 8), (PINHOLE, True, 8)]
+)
+def test_what_is_kept_stays_within_its_bound_and_what_is_not_has_the_same_bytes(lens, alpha, n, share):
+    """Two epochs over 150 photographs of few pixels, all sizes in the order of a run; over few of other kinds. Bytes are
+    counted."""
+    image = np.random.default_rng(0).integers(0, 255, (lens.height, lens.width, 4 if alpha else 3), np.uint8)
+    data = dataset([lens] * n, images=[image] * n)
+    few = Photographs(dataset([lens], images=[image]))
+    bound = int(share * estimate_bytes(data.cameras, (4, 2, 1)))
+    photographs, most = Photographs(data, most_bytes=bound), 0
+    for factor in (4, 2, 1):
+        for _ in range(2):
+            for i in range(n):
+                view = photographs.view(i, factor)
+                assert (view.image == few.view(0, factor).image).all()
+            most = max(most, photographs.nbytes)
+        photographs.drop(factor)
+    assert most <= bound and (share == 0 or most > 0.4 * bound)
+    photographs.drop(1)
+    first = photographs.view(0, 1)
+    assert (photographs.view(0, 1) is first) == (share == 1 or share > 0 and not alpha)
+
+
 def test_the_same_bytes_for_any_number_of_threads():
     made = [Photographs(dataset([BARREL] * 5), threads=n).level(2) for n in (1, 4)]
     for a, b in zip(*made, strict=True):

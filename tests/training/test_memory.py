@@ -1,12 +1,21 @@
 """The estimate of training memory: sums of real array sizes, and a refusal that says what to try."""
 
 import dataclasses
+import json
+import os
+import threading
 import tracemalloc
+import weakref
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from nerfvol.cameras.camera import Intrinsics
+from nerfvol.cameras.paths import orbit
+from nerfvol.datasets import load
 from nerfvol.datasets.load import load_dataset
+from nerfvol.datasets.photographs import FACTORS, Photographs
 from nerfvol.datasets.tiles import TileBank
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
@@ -194,3 +203,55 @@ def test_a_pyramid_level_need_not_stand_beside_what_is_made_of_it(dataset):
     finally:
         tracemalloc.stop()
     assert len(sums) == len(dataset) and peak < 3 * 200 * 200 * len(dataset)
+
+
+def many_photographs(folder, n):
+    """A transforms.json of ``n`` photographs of 40x30, names of one file."""
+    lens = Intrinsics(40, 30, 50.0, 50.0, 20.0, 15.0)
+    picture = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    Image.fromarray(picture).save(folder / "0000.jpg")
+    frames = []
+    for i, camera in enumerate(orbit(n, center=(0, 0, 0), radius=3.0, elevation_deg=20.0, intrinsics=lens)):
+        if i:
+            os.link(folder / "0000.jpg", folder / f"{i:04d}.jpg")
+        frames.append({"file_path": f"{i:04d}.jpg", "transform_matrix": camera.c2w.tolist()})
+    shared = {"w": 40, "h": 30, "fl_x": 50.0, "fl_y": 50.0, "cx": 20.0, "cy": 15.0}
+    (folder / "transforms.json").write_text(json.dumps(shared | {"frames": frames}))
+    return folder
+
+
+def test_many_photographs_are_shrunk_as_many_at_a_time_as_there_are_threads(tmp_path, monkeypatch):
+    """Bytes are counted, not megabytes of pictures made: at full size one picture for each thread."""
+    held, most, lock, read = [0], [0], threading.Lock(), load.read_pixels
+
+    def count(more):
+        with lock:
+            held[0] += more
+            most[0] = max(most[0], held[0])
+
+    def counted(*arguments):
+        pixels = read(*arguments)
+        count(pixels.nbytes)
+        weakref.finalize(pixels, count, -pixels.nbytes)
+        return pixels
+
+    monkeypatch.setattr(load, "read_pixels", counted)
+    data = load_dataset(many_photographs(tmp_path, 150), "train", downscale=2, threads=3)
+    assert data.nbytes == len(data) * 20 * 15 * 3 and len(data) > 120 and held[0] == 0
+    assert 0 < most[0] <= 3 * 40 * 30 * 3
+
+
+@pytest.mark.parametrize("share", [0.5, 2.0])
+def test_what_photographs_keep_is_what_is_stated(tmp_path, share):
+    data = load_dataset(many_photographs(tmp_path, 40), "train")
+    whole = Photographs(data)
+    bound = int(share * memory.estimate_bytes(whole.cameras, FACTORS))
+    photographs = Photographs(data, most_bytes=bound)
+    for factor in FACTORS:
+        photographs.level(factor)
+    stated, kept = memory.photographs_held(data, photographs, FACTORS)
+    assert 0.9 * stated < data.nbytes + photographs.nbytes <= stated and kept == pytest.approx(min(1, share), rel=1e-3)
+
+
+def test_half_of_the_free_memory_is_for_photographs():
+    assert memory.photographs_bytes(10 << 30) == 5 << 30
