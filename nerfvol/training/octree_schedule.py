@@ -22,8 +22,8 @@ ENOUGH_TILES, ENOUGH_TILES_OF_PHOTOGRAPHS = 20_000, 80_000
 """... and so many at most: around photographs much is seen at the rim of a few of them only, which takes more tiles to meet."""
 FINE_LEVEL = 9
 """From this level on a stage splits leaves once, and ..."""
-FINE_STEPS = 2500
-"""... is left out where fewer steps would be left for it."""
+FINE_STEPS, FINER_STEPS = 1000, 2500
+"""... is left out where fewer steps would be left for it: the first number at that level, the second at those beyond."""
 PRUNE_SHARE, FEWEST_PRUNE_STEPS = 0.05, 10
 """Of the steps that a run will make, what comes before a pruning at most, and the fewest: a run that has no time for
 ``prune_steps`` in each stage had better be rough in all of them than stay in the first."""
@@ -93,8 +93,10 @@ def stages_for(
 def is_worth_it(config: OctreeConfig, stage: int, steps: float, progress: float) -> bool:
     """Whether ``stage`` would have the steps that it needs, a coarse one for its prunings, in a run of ``steps``."""
     left = steps * (1 - progress)
-    needed = FINE_STEPS if config.levels[stage] >= FINE_LEVEL else config.prunes[stage] * prune_steps(config, steps)
-    return left >= needed
+    level = config.levels[stage]
+    if level < FINE_LEVEL:
+        return left >= config.prunes[stage] * prune_steps(config, steps)
+    return left >= (FINE_STEPS if level == FINE_LEVEL else FINER_STEPS)
 
 
 def first_stage(config: OctreeConfig, octree: Octree, scene: SceneBounds) -> int:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import OctreeConfig, SceneChoices
+from nerfvol.config.training import OctreeConfig, SceneChoices, finest_level
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.store import Corrected
 from nerfvol.datasets.tiles import Cursors, TileBank
@@ -107,8 +107,12 @@ class OctreeTrainer:
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
     def stages_left(self) -> int:
-        """See Phase."""
-        return len(self.config.levels) - 1 - self.stage
+        """See Phase; without those whose leaves are smaller than the pictures can show."""
+        lens = [camera.intrinsics for camera in self.dataset.cameras]
+        finest = finest_level(max(min(each.width, each.height) for each in lens))
+        c, stage = self.config, self.stage
+        after = zip(c.levels[stage + 1 :], c.downscales[stage + 1 :], strict=True)
+        return sum(level <= finest or downscale < c.downscales[stage] for level, downscale in after)
 
     def share_of(self, seconds: float) -> float:
         """All of the time left: nothing comes after the octree."""

@@ -4,6 +4,8 @@ What is traced is the same source that numba compiles, without the minute that c
 planted and seen in seconds. Scenes have second values: two lights of two strengths, albedos between 0 and 1, null boundaries.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ DIM, BRIGHT = lights.directional((0.6, 0.0, 0.8), (1.0, 2.0, 3.0)), lights.direc
 
 
 def test_nothing_here_is_compiled():
-    assert numba.config.DISABLE_JIT  # pyright: ignore[reportAttributeAccessIssue]
+    assert numba.config.DISABLE_JIT  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 
 def pixel(eye, target):
@@ -34,7 +36,10 @@ def seen(scene, camera, **path):
     return picture.rgb, picture.variance
 
 
-FLOOR = {"shapes": [surfaces.plane(0, (0, 0, 0), (0, 0, 1))], "materials": [materials.lambert((0.9, 0.5, 0.2))]}
+FLOOR: dict[str, Any] = {
+    "shapes": [surfaces.plane(0, (0, 0, 0), (0, 0, 1))],
+    "materials": [materials.lambert((0.9, 0.5, 0.2))],
+}
 
 
 @pytest.mark.parametrize("above", [False, True])
@@ -100,7 +105,7 @@ def test_the_nearer_of_two_lamps_is_met():
 def test_a_sky_of_three_colours():
     zenith, horizon, ground = (0.1, 0.2, 0.9), (0.8, 0.8, 0.8), (0.3, 0.2, 0.1)
     blends = [sky_blend(zenith, horizon, ground, z) for z in (1.0, 0.25, 0.0, -0.0625, -0.125, -1.0)]
-    middle = [0.5 * (np.array(a) + horizon) for a in (zenith, ground)]
+    middle = [tuple(0.5 * (x + y) for x, y in zip(a, horizon, strict=True)) for a in (zenith, ground)]
     assert np.allclose(blends, [zenith, middle[0], horizon, middle[1], ground, ground])
 
 

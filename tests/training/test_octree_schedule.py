@@ -79,10 +79,26 @@ def test_what_tells_what_no_ray_needs():
 
 
 def test_a_fine_stage_needs_steps():
-    """2,500 of them; a coarse one as many as its prunings wait."""
+    """1,000 of them at level 9, 2,500 beyond; a coarse one as many as its prunings wait."""
     config = OctreeConfig()
-    assert not is_worth_it(config, 5, 3298, 0.35) and is_worth_it(config, 5, 3298, 0.24)
+    assert config.levels[4:] == [8, 9, 10]
+    assert not is_worth_it(config, 5, 1500, 0.35) and is_worth_it(config, 5, 1600, 0.35)
+    assert not is_worth_it(config, 6, 6200, 0.6) and is_worth_it(config, 6, 6300, 0.6)
     assert is_worth_it(config, 4, 400, 0.8) and not is_worth_it(config, 4, 400, 0.95)
+
+
+@pytest.mark.parametrize("downscale, left", [(1, [1, 0]), (4, [0, 0])])
+def test_what_pictures_cannot_show_is_no_stage_that_is_missing(tiny_scene, downscale, left):
+    """Pictures of 40 pixels show leaves of level 6, of 10 pixels of level 4."""
+    config = OctreeConfig(
+        levels=[5, 6, 9], downscales=[1, 1, 1], stage_ends=[0.1, 0.2, 1.0], tiles=[8] * 3, prunes=[0] * 3
+    )
+    trainer = OctreeTrainer(load_dataset(tiny_scene, "train", downscale), (1, 1, 1), config, 0, None)
+    assert trainer.stages_left == left[0]
+    trainer.stage = 1
+    assert trainer.stages_left == left[1]
+    trainer.config = dataclasses.replace(config, downscales=[4, 2, 1])
+    assert trainer.stages_left == left[1] + 1
 
 
 MANY = {"levels": [3, 4, 4, 5, 5], "downscales": [4, 4, 2, 2, 1], "stage_ends": [0.01, 0.02, 0.05, 0.1, 1.0],
