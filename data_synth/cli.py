@@ -20,6 +20,7 @@ from data_synth import integrators, scene_file, scenes
 from data_synth.cameras import Camera
 from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError, RenderWarning
+from data_synth.files import remove_leftovers
 from data_synth.image import Picture, encode_png, write_png
 from data_synth.integrators import Integrator
 from data_synth.jit import say_when_compiling
@@ -291,6 +292,7 @@ def _portrait(
     pixels = portrait(
         whole, camera, args.exposure, args.denoise, lambda view: render_view(scene, view, glance, args.seed)
     )
+    remove_leftovers(Path(args.picture).parent)
     write_png(args.picture, pixels)
     print(f"{args.picture}: {scene.name} in {time.perf_counter() - started:.1f} s")
     return 0

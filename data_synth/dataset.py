@@ -17,7 +17,8 @@ import numpy as np
 
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
-from data_synth.image import Picture, replacing
+from data_synth.files import remove_leftovers, replacing
+from data_synth.image import Picture
 from data_synth.integrators import Integrator
 from data_synth.scene import Scene
 from data_synth.suns import LIGHTS, Sun, document, shared_out, suns_of
@@ -98,8 +99,10 @@ def write_dataset(scene: Renderable, out_dir: str | os.PathLike, options: Option
         wanted = views[first : last + 1 : step]
     if not _claim(out_dir, record, shared=options.chosen is not None):
         return out_dir
+    remove_leftovers(out_dir)
     for split in splits:
         (out_dir / split).mkdir(exist_ok=True)
+        remove_leftovers(out_dir / split)
     wanted = [view for view in wanted if not _is_there(out_dir, view, options.exr)]
     with ThreadPoolExecutor(1) as writer:  # compresses and writes a picture while the next one renders
 

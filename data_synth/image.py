@@ -9,9 +9,6 @@ from __future__ import annotations
 import io
 import os
 import struct
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,7 @@ from numpy.typing import ArrayLike
 from PIL import Image as PillowImage
 
 from data_synth.errors import InputError
+from data_synth.files import replacing
 
 
 @dataclass
@@ -60,21 +58,6 @@ def srgb_to_linear(x: np.ndarray) -> np.ndarray:
     """The inverse of ``linear_to_srgb`` on [0, 1]."""
     x = np.clip(x, 0.0, 1.0)
     return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0.04045) + 0.055) / 1.055) ** 2.4)
-
-
-@contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path next to ``path`` that takes its place on success: a reader never sees half a file."""
-    path = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_png(path: str | os.PathLike, pixels: np.ndarray) -> None:

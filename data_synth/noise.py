@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_synth.image import replacing
+from data_synth.files import replacing
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.rng import mix
 from data_synth.vec import trilinear

@@ -23,7 +23,7 @@ import numpy as np
 
 from data_synth import materials as stuff
 from data_synth import media, surfaces
-from data_synth.image import replacing
+from data_synth.files import replacing
 
 if TYPE_CHECKING:
     from data_synth.scene import Scene

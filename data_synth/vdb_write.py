@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_synth.errors import InputError
-from data_synth.image import replacing
+from data_synth.files import replacing
 
 MAGIC = 0x56444220
 VERSION = 224

@@ -10,7 +10,7 @@ import numpy as np
 
 from data_synth import media, medical
 from data_synth.errors import InputError, RenderWarning
-from data_synth.image import replacing
+from data_synth.files import replacing
 from data_synth.vdb import read_vdb
 from data_synth.vdb_write import write_vdb
 

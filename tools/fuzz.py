@@ -1,17 +1,20 @@
 """Damages files of every kind where their structure is, and looks for anything but a result or one sentence.
 
-    python tools/fuzz.py [--seconds 60] [--seed 0] [--keep DIR]      (make fuzz)
+    python tools/fuzz.py [--seconds 60] [--seed 0] [--only NAME] [--keep DIR]      (make fuzz)
 
 Documents are changed value by value (another type, huge, negative, empty, nested, gone), binary files byte by byte and cut.
-What readers raise besides InputError is a find, and so is what takes longer than ten seconds or 6 GB: it is printed with the
-seed and the number that make it again, and its file is kept in --keep. The exit code is 1 where there are finds.
+What readers raise besides InputError is a find, and so is what ends the interpreter, takes longer than ten seconds or, at any
+moment, 2 GB: it is printed with the kind and the number that make it again (SEED KIND NUMBER), and its file is kept in --keep.
+All kinds get the same time, so that the quick ones are tried more often. The exit code is 1 where there are finds.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import json
+import os
 import random
 import shutil
 import signal
@@ -27,27 +30,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from nerfvol.cameras.paths import load_cameras
-from nerfvol.config.assemble import assemble, read_yaml
-from nerfvol.config.training import Config
-from nerfvol.datasets.load import load_dataset
-from nerfvol.errors import InputError
-from nerfvol.files.arrayfile import ArrayFile, write_arrays
-from nerfvol.files.checkpoint import save_checkpoint
-from nerfvol.measure.truth import load_grid
-from nerfvol.models import load_model
-from nerfvol.octree.io import save_octree
-from nerfvol.octree.tree import Octree
-from nerfvol.splats.io import save_splats
-from nerfvol.splats.splats import Splats
-from nerfvol.training.session import read_saved
-from tests.fixtures import scenes
+from fuzz_kinds import targets
 
-SECONDS_EACH, BYTES = 10, 6 << 30
-ODD: tuple[Any, ...] = (
-    None, True, False, 0, -1, 1, 2**31, 2**63, 10**400, -(10**400), 0.5, 1e-320, 1e308, -1e308, float("nan"), float("inf"), "",
-    "x", "1e3", "\x1b]0;x\x07", "\ud800", "../../x", "a\0b", [], [[]], [1], [None] * 3, {}, {"a": []}, "9" * 5000,
-)  # fmt: skip
+from nerfvol.errors import InputError
+from nerfvol.machine import peak_memory
+
+SECONDS_EACH, BYTES, ADDRESSES = 10, 2 << 30, 6 << 30
 
 
 class TooLong(Exception):
@@ -68,212 +56,118 @@ def bounded() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-# ------------------------------------------------------------------ damage
-def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """The paths to all values inside a document."""
-    found = [at] if at else []
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inside in items:
-        found += places(inside, (*at, key))
-    return found
+class Tries:
+    """What was tried so far of each kind, and what was found; kept on disk, since a reader may end the process."""
+
+    def __init__(self, names: list[str], seed: int) -> None:
+        self.seed, self.names = seed, names
+        self.count, self.seconds = dict.fromkeys(names, 0), dict.fromkeys(names, 0.0)
+        self.refused = 0
+        self.finds: dict[str, str] = {}
+
+    def one(self, name: str, change: Callable[[random.Random], None], read: Callable[[], object], note: Path) -> None:
+        """Damages a file and reads it."""
+        key, began = f"{self.seed} {name} {self.count[name]}", time.monotonic()
+        note.write_text(key)
+        try:
+            change(random.Random(key))
+            with bounded(), np.errstate(all="ignore"):
+                read()
+        except InputError as error:
+            self.refused += 1
+            if "\n" in str(error) or len(str(error)) > 1000:
+                self.find(f"{name}: no short sentence: {str(error)[:300]!r}", key)
+        except (Exception, TooLong) as error:  # a find
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{Path(where.filename).name}:{where.lineno}"
+            self.find(f"{name}: {type(error).__name__} at {place}: {str(error)[:90]!r}", key)
+        if peak_bytes() > BYTES:
+            self.find(f"{name}: {peak_bytes() / 1e9:.1f} GB", key)
+        self.count[name] += 1
+        self.seconds[name] += time.monotonic() - began
+
+    def find(self, text: str, key: str) -> None:
+        """Prints it, once a kind."""
+        kind = text.split(": '")[0]
+        if kind not in self.finds:
+            self.finds[kind] = key
+            print(f"{text}   ({key})", flush=True)
 
 
-def damaged(document: Any, rng: random.Random) -> Any:
-    """The document with one to three of its values changed, gone, doubled or moved."""
-    document = json.loads(json.dumps(document))
-    for _ in range(rng.randint(1, 3)):
-        known = places(document)
-        if not known:
-            return rng.choice(ODD)
-        *way, last = rng.choice(known)
-        parent = document
-        for key in way:
-            parent = parent[key]
-        kind = rng.randrange(5)
-        if kind == 0 and isinstance(parent, dict):
-            parent[rng.choice(("format", "frames", "k1", "aabb", "camera_model", "mask_path", "x" * 70))] = rng.choice(
-                ODD
-            )
-        elif kind == 1 and isinstance(parent, (dict, list)):
-            del parent[last]
-        elif kind == 2 and isinstance(parent[last], (int, float)) and not isinstance(parent[last], bool):
-            factor, more = rng.choice((-1, 0, 2, 0.33, 1e6, 1e-6, 1e300)), rng.choice((0, 1, 1e6))
-            with contextlib.suppress(OverflowError):
-                parent[last] = parent[last] * factor + more
-        elif kind == 3 and isinstance(parent, list):
-            parent.insert(rng.randrange(len(parent) + 1), parent[last])
-        else:
-            parent[last] = rng.choice(ODD)
-    return document
+def peak_bytes() -> int:
+    """The most memory that this process had, bytes; 0 where the system does not tell."""
+    return peak_memory() or 0
 
 
-def broken(data: bytes, rng: random.Random) -> bytes:
-    """Bytes with some flipped, cut, or overwritten with extreme numbers."""
-    out = bytearray(data)
-    for _ in range(rng.randint(1, 4)):
-        if not out:
-            break
-        at, kind = rng.randrange(len(out)), rng.randrange(4)
-        if kind == 0:
-            out[at] ^= 1 << rng.randrange(8)
-        elif kind == 1:
-            del out[at:]
-        elif kind == 2:
-            out[at : at + 8] = rng.choice(
-                (b"\xff" * 8, b"\0" * 8, np.float64("nan").tobytes(), (2**40).to_bytes(8, "little"))
-            )
-        else:
-            out[at:at] = bytes(rng.randrange(256) for _ in range(rng.randint(1, 9)))
-    return bytes(out)
+def work(folder: Path, tries: Tries, seconds: float, only: str | None) -> None:
+    """Tries until the time is over."""
+    known = {name: (change, read) for name, change, read in targets(folder) if only in (None, name)}
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        name = min(known, key=lambda name: tries.seconds[name])
+        tries.one(name, *known[name], folder / "trying")
 
 
-# ------------------------------------------------------------------ what is read
-def of_json(path: Path) -> Callable[[random.Random], None]:
-    whole = json.loads(path.read_text())
-
-    def change(rng: random.Random) -> None:
-        path.write_text(json.dumps(damaged(whole, rng)), encoding="utf-8", errors="surrogatepass")
-
-    return change
-
-
-def of_bytes(path: Path) -> Callable[[random.Random], None]:
-    whole = path.read_bytes()
-
-    def change(rng: random.Random) -> None:
-        path.write_bytes(broken(whole, rng))
-
-    return change
-
-
-def of_header(path: Path) -> Callable[[random.Random], None]:
-    """The document in the header of an array file."""
-    with ArrayFile(path, "file") as file:
-        document, arrays = file.document, {name: file.read(name) for name in file.shapes}
-
-    def change(rng: random.Random) -> None:
-        with contextlib.suppress(ValueError):  # a document that JSON cannot hold
-            write_arrays(path, arrays, damaged(document, rng))
-
-    return change
-
-
-def targets(folder: Path) -> list[tuple[str, Callable[[random.Random], None], Callable[[], object]]]:
-    """(name, what damages a file, what reads it)."""
-    found = []
-
-    def add(name: str, change: Callable[[random.Random], None], read: Callable[[], object]) -> None:
-        found.append((name, change, read))
-
-    def sets(name: str, write: Callable[..., object], *files: str) -> None:
-        for file in files:
-            home = folder / f"{name}_{len(found)}"
-            home.mkdir()
-            write(home, scenes.ring(), scenes.random_images())
-            path = home / file
-            change = of_json(path) if path.suffix == ".json" else of_bytes(path)
-            add(f"{name} {file}", change, lambda home=home: load_dataset(home).points)
-
-    sets("nerfstudio", scenes.write_nerfstudio, "transforms.json")
-    sets("ngp", scenes.write_instant_ngp, "transforms.json", "images/view_003.png")
-    sets("colmap", scenes.write_colmap, "sparse/0/images.bin", "sparse/0/cameras.bin")
-    sets("text", lambda *a: scenes.write_colmap(*a, text=True), "sparse/0/images.txt", "sparse/0/cameras.txt")
-    sets("llff", scenes.write_llff, "poses_bounds.npy")
-    sets("nsvf", scenes.write_nsvf, "intrinsics.txt", "pose/0_view_001.txt")
-
-    octree = Octree.from_leaves([1] * 8, np.argwhere(np.ones((2, 2, 2))), [0, 0, 0], 1.0)
-    orbit = {"center": [0.5, 0.5, 0.5], "radius": 2.0, "elevation_deg": 20.0, "up": [0, 0, 1], "size": [16, 16]}
-    for storage in ("float32", "compact"):
-        for how in (of_header, of_bytes):
-            path = folder / f"octree_{storage}_{len(found)}.safetensors"
-            save_octree(path, octree, {"orbit": orbit, "background": [1, 1, 1]}, storage)
-            add(f"octree {storage} {how.__name__}", how(path), lambda path=path: draw(path))
-    normal = lambda *shape: np.random.default_rng(0).normal(size=shape).astype(np.float32)  # noqa: E731
-    splats = Splats(normal(9, 3), normal(9, 3) - 3, normal(9, 4), normal(9), normal(9, 3, 4))
-    for how in (of_header, of_bytes):
-        path = folder / f"splats_{len(found)}.safetensors"
-        save_splats(path, splats, {"near": 0.01, "orbit": orbit})
-        add(f"splats {how.__name__}", how(path), lambda path=path: draw(path))
-    for how in (of_header, of_bytes):
-        path = folder / f"checkpoint_{len(found)}.safetensors"
-        state = {"phase": "octree", "elapsed": 1.0, "phase_started": 0.5, "running": 0.1, "log_bytes": 0, "results": {},
-                 "steps": {"octree": 3}, "trainer": {"values": np.zeros(3, np.float32)}}  # fmt: skip
-        save_checkpoint(path, state)
-        add(f"checkpoint {how.__name__}", how(path), lambda path=path: read_saved(path))
-    path = folder / "path.json"
-    frames = [{"transform_matrix": camera.c2w.tolist()} for camera in scenes.ring(3)]
-    path.write_text(json.dumps({"camera_angle_x": 0.7, "w": 16, "h": 16, "frames": frames}))
-    add("camera path", of_json(path), lambda: load_cameras(path))
-    grid = folder / "density.npz"
-    np.savez_compressed(grid, density=np.ones((3, 3, 3)), lo=np.zeros(3), hi=np.ones(3), voxel_size=np.full(3, 1 / 3))
-    add("truth", of_bytes(grid), lambda: load_grid(grid))
-    yaml = folder / "run.yaml"
-    yaml.write_text(
-        "seed: 3\ntime_budget: 5m\nbackground: [1, 0, 0]\noctree:\n  steps: 5\n  levels: [5, 6]\nfield:\n  rate: 1e-3\n"
-    )
-    add("settings", of_bytes(yaml), lambda: assemble(Config, (read_yaml(yaml), str(yaml)), say=lambda sentence: None))
-    plain = {"seed": 3, "time_budget": "5m", "background": [1, 0, 0], "octree": {"steps": 5, "sh_degree": 1}}
-    values: list[Any] = [plain]
-    add("setting's values", lambda rng: values.__setitem__(0, damaged(plain, rng)),
-        lambda: assemble(Config, (values[0] if isinstance(values[0], dict) else {}, "a.yaml"), say=len))  # fmt: skip
-    return found
-
-
-def draw(path: Path) -> None:
-    """What ``nerfvol render FILE --orbit 1`` does with a model's file."""
-    from nerfvol.cameras.paths import orbit_cameras
-    from nerfvol.cli.target import open_target
-
-    target = open_target(str(path))
-    for camera in orbit_cameras(1, target.orbit(), (8, 8)):
-        target.model.render(camera, target.background)
-    load_model(path).describe()
-
-
-# ------------------------------------------------------------------ the run
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", help="one kind")
     parser.add_argument("--keep", type=Path, default=Path("build/fuzz"))
     given = parser.parse_args()
     with contextlib.suppress(ImportError):
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    finds: dict[str, str] = {}
-    count, refused, began = 0, 0, time.monotonic()
+        resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, resource.getrlimit(resource.RLIMIT_AS)[1]))
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        known = targets(folder)
-        while time.monotonic() - began < given.seconds:
-            name, change, read = known[count % len(known)]
-            rng = random.Random(f"{given.seed} {count}")
-            change(rng)
-            try:
-                with bounded(), np.errstate(all="ignore"):
-                    read()
-            except InputError as error:
-                refused += 1
-                if ("\n" in str(error) or len(str(error)) > 1000) and (
-                    text := f"{name}: no short sentence"
-                ) not in finds:
-                    finds[text] = f"{given.seed} {count}"
-                    print(f"{text}: {str(error)[:300]!r}   (seed and number {finds[text]})", flush=True)
-            except (Exception, TooLong) as error:  # a find
-                where = traceback.extract_tb(error.__traceback__)[-1]
-                text = (
-                    f"{name}: {type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {str(error)[:90]!r}"
-                )
-                if text not in finds:
-                    finds[text] = f"{given.seed} {count}"
-                    print(f"{text}   (seed and number {finds[text]})", flush=True)
-            count += 1
-        if finds:
-            given.keep.mkdir(parents=True, exist_ok=True)
-            shutil.copytree(folder, given.keep, dirs_exist_ok=True)
-    print(f"{count} files in {time.monotonic() - began:.0f} s: {refused} refused, {len(finds)} kinds of finds")
-    return 1 if finds else 0
+        tries = Tries([name for name, *_ in targets(Path(temporary))], given.seed)
+    began = time.monotonic()
+    while (left := given.seconds - (time.monotonic() - began)) > 0:
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary)
+            part = functools.partial(work, folder, tries, left, given.only)
+            result = _in_a_process_of_its_own(part, tries)
+            if isinstance(result, Tries):
+                tries = result
+            else:
+                key = (folder / "trying").read_text()
+                name = key.split(" ", 1)[1].rsplit(" ", 1)[0]
+                tries.find(f"{name}: the interpreter ended with {result}", key)
+                tries.count[name] = int(key.rsplit(" ", 1)[1]) + 1
+                tries.seconds[name] += SECONDS_EACH
+            if tries.finds:
+                given.keep.mkdir(parents=True, exist_ok=True)
+                shutil.copytree(folder, given.keep, dirs_exist_ok=True)
+    n = sum(tries.count.values())
+    print(f"{n} files of {len(tries.names)} kinds in {time.monotonic() - began:.0f} s: {tries.refused} refused, "
+          f"{len(tries.finds)} kinds of finds")  # fmt: skip
+    return 1 if tries.finds else 0
+
+
+def _in_a_process_of_its_own(work: Callable[[], None], tries: Tries) -> Tries | int:
+    """What ``tries`` became; the exit status where the process ended before it could say. Here where there is no fork."""
+    if not hasattr(os, "fork"):
+        work()
+        return tries
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        work()
+        with os.fdopen(writing, "w") as out:
+            json.dump(
+                {"count": tries.count, "seconds": tries.seconds, "refused": tries.refused, "finds": tries.finds}, out
+            )
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as said:
+        text = said.read()
+    _, status = os.waitpid(child, 0)
+    if not text:
+        return os.waitstatus_to_exitcode(status)
+    for name, value in json.loads(text).items():
+        setattr(tries, name, value)
+    return tries
 
 
 if __name__ == "__main__":

@@ -16,7 +16,8 @@ import numpy as np
 
 from data_synth import checks
 from data_synth.cameras import Camera, Viewpoints, pixel_ray
-from data_synth.image import Picture, replacing
+from data_synth.files import replacing
+from data_synth.image import Picture
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.scenes import showcase_sdf as sdf
 from data_synth.scenes.showcase_sdf import FLOOR

@@ -108,10 +108,11 @@ def set_threads(threads: int) -> int:
 
 
 def prepare_outputs(folder: str | None = None, file: str | None = None) -> None:
-    """Make the folders that a command will write to, before it spends time on what it writes."""
-    from nerfvol.files.atomic import ensure_writable_folder, is_special
+    """Make the folders that a command will write to, before it spends time on what it writes; what killed writers left there
+    goes."""
+    from nerfvol.files.atomic import ensure_writable_folder, is_special, remove_leftovers
 
     if folder is not None:
-        ensure_writable_folder(folder)
+        remove_leftovers(ensure_writable_folder(folder))
     if file is not None and not is_special(file):
-        ensure_writable_folder(Path(os.path.realpath(file)).parent)
+        remove_leftovers(ensure_writable_folder(Path(os.path.realpath(file)).parent))

@@ -310,7 +310,7 @@ class OctreeConfig(Checked):
         most = max(1, side // SMALLEST_PICTURE)
         if any(getattr(self, name) != getattr(plain, name) for name in names) or most >= max(self.downscales):
             return self
-        factor, level = 1 << (most.bit_length() - 1), max(self.levels[0], (2 * side).bit_length() - 1)
+        factor, level = 1 << (most.bit_length() - 1), max(self.levels[0], finest_level(side))
         rows = [(min(row[0], level), min(row[1], factor), *row[2:])
                 for row in zip(*(getattr(self, name) for name in names), strict=True)]  # fmt: skip
         kept = [
@@ -319,6 +319,11 @@ class OctreeConfig(Checked):
         columns = {name: [row[i] for row in kept] for i, name in enumerate(names)}
         columns["prunes"] = [min(n, 1) for n in columns["prunes"][:-1]] + columns["prunes"][-1:]
         return dataclasses.replace(self, **columns)
+
+
+def finest_level(side: int) -> int:
+    """Of leaves that pictures of ``side`` pixels along their shorter side can show: no smaller than half a pixel."""
+    return (2 * side).bit_length() - 1
 
 
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,

@@ -164,7 +164,7 @@ def _frame(
     listed = entry.get("file_path")
     if not isinstance(listed, str) or not listed or "\0" in listed:
         raise InputError(f"{where}: expected file_path to name an image, got {shown(listed):.60}")
-    where = f"{where} ({listed})"
+    where = f"{where} ({listed if len(listed) <= LONGEST_NAME else shown(listed)})"
     if "transform_matrix" not in entry:
         raise InputError(f"{where}: transform_matrix is missing")
     everything = {**shared, **entry}
@@ -183,6 +183,8 @@ def _frame(
     return Frame(listed, path, c2w, calibration, masks.of(listed, path, mask or None), light)
 
 
+LONGEST_NAME = 200
+"""Letters of a picture's name that sentences show whole."""
 _USED = {"frames", "file_path", "transform_matrix", "mask_path", "aabb", "aabb_scale", "ply_file_path",
          *CALIBRATION_KEYS, *(f"{split}_filenames" for split in SPLITS)}  # fmt: skip
 _EMPTY = (None, "", [], {}, 0, 0.0, False)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import OctreeConfig, SceneChoices
+from nerfvol.config.training import OctreeConfig, SceneChoices, finest_level
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.store import Corrected
 from nerfvol.datasets.tiles import Cursors, TileBank
@@ -25,11 +25,19 @@ from nerfvol.machine import return_free_memory
 from nerfvol.octree.rows import convert_rows
 from nerfvol.octree.topology import Transfer
 from nerfvol.octree.tree import Octree
-from nerfvol.region import SceneBounds
 from nerfvol.starts.fog import low_density_octree
 from nerfvol.starts.visible import ENOUGH_VIEWS, solid
 from nerfvol.training.appearance import Appearance, small_picture
 from nerfvol.training.memory import OctreePlan, splits_within
+from nerfvol.training.octree_schedule import (
+    FINE_LEVEL,
+    Stages,
+    enough_tiles,
+    first_stage,
+    is_worth_it,
+    prune_steps,
+    stages_for,
+)
 from nerfvol.views import OctreeModel, render_image
 
 BACKGROUND_STREAM = 2
@@ -41,17 +49,8 @@ SECONDS_TO_WRITE = 0.5
 SECONDS_TO_WRITE_A_LEAF = 1.5e-6
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees are in memory while one is made."""
-COVERAGE = 0.5
-"""Share of the foreground tiles that were seen before leaves are pruned, ..."""
-ENOUGH_TILES, ENOUGH_TILES_OF_PHOTOGRAPHS = 20_000, 80_000
-"""... and so many at most: around photographs much is seen at the rim of a few of them only, which takes more tiles to meet."""
-FINE_LEVEL = 9
-"""From this level on a stage splits leaves once, and ..."""
-FINE_STEPS = 2500
-"""... is left out where fewer steps would be left for it."""
-PRUNE_SHARE, FEWEST_PRUNE_STEPS = 0.05, 10
-"""Of the steps that a run will make, what comes before a pruning at most, and the fewest: a run that has no time for
-``prune_steps`` in each stage had better be rough in all of them than stay in the first."""
+MOST_LEVELS_AT_ONCE = 2
+"""Where stages are left out: more would split haze that was never pruned."""
 BETA = 0.98
 """Memory, per step, of RMSprop's second moments."""
 FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
@@ -108,8 +107,12 @@ class OctreeTrainer:
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
     def stages_left(self) -> int:
-        """See Phase."""
-        return len(self.config.levels) - 1 - self.stage
+        """See Phase; without those whose leaves are smaller than the pictures can show."""
+        lens = [camera.intrinsics for camera in self.dataset.cameras]
+        finest = finest_level(max(min(each.width, each.height) for each in lens))
+        c, stage = self.config, self.stage
+        after = zip(c.levels[stage + 1 :], c.downscales[stage + 1 :], strict=True)
+        return sum(level <= finest or downscale < c.downscales[stage] for level, downscale in after)
 
     def share_of(self, seconds: float) -> float:
         """All of the time left: nothing comes after the octree."""
@@ -195,9 +198,10 @@ class OctreeTrainer:
         """One step at ``progress`` in [0, 1] of the run."""
         c = self.config
         progress = self._progress = self._start + progress * (1 - self._start)
-        if progress >= c.stage_ends[self.stage] and self.stage + 1 < len(c.levels):
-            if self.prunings == c.prunes[self.stage] and self._seen_enough() and self._worth_splitting(progress):
-                self.next_stage()
+        if progress >= c.stage_ends[self.stage] and (after := self._stages().after(self.stage)) is not None:
+            pruned = self.prunings >= self._stages().prunes[self.stage]
+            if pruned and self._seen_enough() and is_worth_it(c, after, self._steps_in_all(), progress):
+                self.next_stage(after)
         self._prune_inside_stage(progress)
         if self.appearance.due(progress) and self.fit_appearance(progress):
             self.bank = None
@@ -249,14 +253,14 @@ class OctreeTrainer:
         """See FinalPhase."""
         return small_picture(self.dataset, i, self.picture)
 
-    def next_stage(self) -> None:
-        """Prunes, splits the leaves that the next stage wants finer, and turns to its images."""
+    def next_stage(self, stage: int | None = None) -> None:
+        """Prunes, splits the leaves that ``stage`` wants finer, and turns to its images; None: the next one."""
         c = self.config
-        old, self.stage, self.prunings = self.stage, self.stage + 1, 0
+        old, self.stage, self.prunings = self.stage, self.stage + 1 if stage is None else stage, 0
         error, footprint = self.prune()
         footprint = footprint * (c.downscales[old] / c.downscales[self.stage])  # in pixels of the next stage's images
         fine = c.levels[self.stage] >= FINE_LEVEL
-        for _ in range(1 if fine else c.levels[self.stage]):
+        for _ in range(1 if fine else c.levels[self.stage] if self.stage == old + 1 else MOST_LEVELS_AT_ONCE):
             transfer = self._split(error, footprint, c.subdivide_error if fine else self.chosen.coarse_error)
             if transfer is None:
                 break
@@ -285,35 +289,35 @@ class OctreeTrainer:
         self.octree = self.octree.with_sh_degree(degree)
         self.state = ops.TrainState(self.octree, moments)
 
-    def _worth_splitting(self, progress: float) -> bool:
-        """Whether the next stage will have the steps that it needs, a coarse one for its prunings, at the pace so far."""
-        c, stage = self.config, self.stage + 1
-        left = self._steps_in_all() * (1 - progress)
-        return left >= (FINE_STEPS if c.levels[stage] >= FINE_LEVEL else c.prunes[stage] * self._prune_steps())
+    def _stages(self) -> Stages:
+        """Those that the run has the steps for at the pace so far; pictures of half the size have a quarter of the tiles."""
+        c = self.config
+        known = 0 if self.bank is None else len(self.bank.foreground_tiles) * c.downscales[self.stage] ** 2
+        tiles = [known / downscale**2 for downscale in c.downscales]
+        return stages_for(c, self.first_stage, self._steps_in_all(), tiles, self.dataset.scene.is_unbounded)
 
     def _steps_in_all(self) -> float:
         """Steps of a whole run at the pace so far; there is no pace before the first."""
         made = self._progress - self._start
         return self.steps_done / made if made > 0 else math.inf
 
-    def _prune_steps(self) -> float:
-        """Steps before a pruning: those set, fewer where the run is short."""
-        return min(self.config.prune_steps, max(FEWEST_PRUNE_STEPS, PRUNE_SHARE * self._steps_in_all()))
-
     def _seen_enough(self) -> bool:
         """Whether the rays since the last pruning can tell what no ray needs."""
-        enough = ENOUGH_TILES_OF_PHOTOGRAPHS if self.dataset.scene.is_unbounded else ENOUGH_TILES
-        if self.bank is None or self.tiles_seen < self._prune_steps() * self.config.tiles[self.stage]:
+        if self.bank is None:
             return False
-        return self.tiles_seen >= min(COVERAGE * len(self.bank.foreground_tiles), enough)
+        fewest = prune_steps(self.config, self._steps_in_all())
+        enough = enough_tiles(len(self.bank.foreground_tiles), self.dataset.scene.is_unbounded)
+        batch = self.config.tiles[self.stage]
+        return self.tiles_seen >= min(max(fewest * batch, enough), self._stages().wait * batch)
 
     def _prune_inside_stage(self, progress: float) -> None:
         """Prunes where it is due, and splits where that pays."""
         c = self.config
         start = c.stage_ends[self.stage - 1] if self.stage else 0.0
-        due = (self.prunings + 1) / (c.prunes[self.stage] + 1)
+        prunes = self._stages().prunes[self.stage]
+        due = (self.prunings + 1) / (prunes + 1)
         if (
-            self.prunings < c.prunes[self.stage]
+            self.prunings < prunes
             and progress >= start + due * (c.stage_ends[self.stage] - start)
             and self._seen_enough()
         ):
@@ -406,10 +410,3 @@ def holds_share(error: np.ndarray, share: float) -> np.ndarray:
     chosen = np.zeros(len(error), dtype=bool)
     chosen[order[: 1 + np.searchsorted(held, share * held[-1])]] = True
     return chosen
-
-
-def first_stage(config: OctreeConfig, octree: Octree, scene: SceneBounds) -> int:
-    """The first stage whose finest level is the octree's, or the last one."""
-    finest = octree.max_level - scene.n_shells
-    reached = [i for i, level in enumerate(config.levels) if level >= finest]
-    return reached[0] if reached else len(config.levels) - 1

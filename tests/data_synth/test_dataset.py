@@ -3,6 +3,9 @@
 import ast
 import inspect
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from data_synth import (
     InputError,
     Options,
     Viewpoints,
+    files,
     look_at,
     media,
     render,
@@ -23,6 +27,7 @@ from data_synth import (
     write_dataset,
 )
 from data_synth.cli import main, render_task
+from data_synth.dataset import split_cameras
 from data_synth.image import Picture, linear_to_srgb, read_exr, srgb_to_linear, write_exr
 from data_synth.scenes.showcase import Showcase, edge_pixels
 from data_synth.views import render_view
@@ -114,6 +119,33 @@ def test_pictures_are_straight_srgb():
     assert np.allclose(srgb_to_linear(linear_to_srgb(x)), x, atol=1e-12)
 
 
+def test_dark_pixels_and_the_exposure_of_pictures():
+    """Below 0.0031 the curve is a line; the exposure scales light, before it; alpha stays."""
+    rgb, alpha = np.array([[[0.002, 0.0005, 0.2]]]), np.array([[0.5]])
+    for exposure in (1.0, 0.25, 3.0):
+        x = exposure * rgb[0, 0] / 0.5
+        want = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+        found = Picture(rgb, alpha, np.zeros((1, 1))).rgba8(exposure)[0, 0]
+        assert found.tolist() == [*np.rint(255 * np.clip(want, 0, 1)), 128]
+    dark = np.array([0.0, 0.001, 0.02, 0.04])
+    assert np.allclose(srgb_to_linear(dark), dark / 12.92)
+    assert np.allclose(
+        Picture(rgb, alpha, alpha).over((0.1, 0.2, 0.4))[0, 0], rgb[0, 0] + 0.5 * np.array([0.1, 0.2, 0.4])
+    )
+
+
+def test_held_out_cameras_are_not_on_the_training_spiral():
+    """Neither in place nor in azimuth: each split's spiral is turned differently."""
+    splits = split_cameras(scenes.make("slab"), 40, (8, 8), 5)
+    assert {split: len(cameras) for split, cameras in splits.items()} == {"train": 40, "val": 2, "test": 5}
+    azimuths = {
+        split: np.array([np.arctan2(c.c2w[1, 3], c.c2w[0, 3]) for c in cameras]) for split, cameras in splits.items()
+    }
+    for a, b in (("train", "val"), ("train", "test"), ("val", "test")):
+        apart = np.angle(np.exp(1j * (azimuths[a][:, None] - azimuths[b][None])))
+        assert np.abs(apart).min() > 1e-4
+
+
 def test_exr_round_trip(tmp_path):
     channels = {n: np.random.default_rng(k).random((5, 7)).astype(np.float32) for k, n in enumerate("RGBAZ")}
     write_exr(tmp_path / "a.exr", channels)
@@ -187,6 +219,27 @@ def test_a_set_that_was_stopped_goes_on_and_never_stands_beside_another_ones_tra
     kept = (out / "train" / "r_0.png").stat().st_mtime_ns
     assert main([*SLAB, "--seed", "5", "--out", str(out)]) == 0
     assert _set(out) == _set(whole) and (out / "train" / "r_0.png").stat().st_mtime_ns == kept
+
+
+def test_what_killed_writers_left_is_removed_by_the_next_run(tmp_path):
+    """Of processes of this machine that are gone; a set that is gone on with, and pictures alone."""
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    ).stdout
+    here = [files._machine(), "0" * 8]
+    names = [
+        f".r_0.{process}.{machine}{'1' * 8}.tmp.png" for machine in here for process in (gone.strip(), os.getpid())
+    ]
+    (tmp_path / "train").mkdir()
+    for folder in (tmp_path, tmp_path / "train"):
+        for name in names:
+            (folder / name).touch()
+    assert main([*SLAB, "--out", str(tmp_path)]) == 0
+    for folder in (tmp_path, tmp_path / "train"):
+        assert sorted(p.name for p in folder.glob(".*.tmp*")) == sorted(names[1:])
+    (tmp_path / names[0]).touch()
+    assert main(["slab", "--integrator", "emission", "--size", "8x6", "--picture", str(tmp_path / "one.png")]) == 0
+    assert not (tmp_path / names[0]).exists()
 
 
 def test_every_view_has_a_seed_of_its_own_whoever_renders_it(tmp_path, monkeypatch):

@@ -2,12 +2,16 @@
 
 import importlib
 import inspect
+import os
+import subprocess
+import sys
 
 import pytest
 
 from nerfvol import export
 from nerfvol.errors import InputError
 from nerfvol.export import EXPORTS, Export, choose, export_model
+from nerfvol.files import atomic
 from nerfvol.octree.io import save_octree
 from nerfvol.views import OctreeModel
 
@@ -81,3 +85,14 @@ def test_options_memory(monkeypatch, sphere_octree, tmp_path):
     with pytest.raises(InputError, match="takes about 1 GiB of memory, 0.5 GiB are free"):
         export_model(model, tmp_path / "a.ply", free=1 << 29)
     assert export_model(model, tmp_path / "a.ply", free=1 << 31, threshold=None)[1] == 7
+
+
+def test_what_killed_writers_left_beside_an_export_is_removed(tmp_path, command, octree_file):
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    ).stdout
+    names = [f".o.{process}.{atomic._machine()}{'1' * 8}.tmp.npz" for process in (gone.strip(), os.getpid())]
+    for name in names:
+        (tmp_path / name).touch()
+    assert command("export", octree_file, "--resolution", "4", "--out", tmp_path / "o.npz")[0] == 0
+    assert [path.name for path in tmp_path.glob(".*.tmp*")] == names[1:]

@@ -14,7 +14,7 @@ from nerfvol.kernels import ops
 from nerfvol.octree.rows import DENSITY_SLOT, explin_inverse
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
-from nerfvol.training import octree_trainer
+from nerfvol.training import octree_schedule
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.views import render_image
 
@@ -43,7 +43,7 @@ def test_a_short_run_comes_to_its_finest_stage(tiny_scene, steps, waits):
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
     for step in range(60):
         tuner.step(step / steps)
-    assert tuner._prune_steps() == pytest.approx(waits, rel=0.02)
+    assert octree_schedule.prune_steps(config, tuner._steps_in_all()) == pytest.approx(waits, rel=0.02)
     assert tuner.stage == (2 if steps == 60 else 1 if steps == 300 else 0)
 
 
@@ -190,7 +190,7 @@ def test_a_run_has_the_settings_of_its_scene(tiny_scene):
 @pytest.mark.parametrize("progress, begins", [(0.7, False), (0.3, True)])
 def test_a_coarse_stage_needs_steps_for_its_prunings(tiny_scene, monkeypatch, progress, begins):
     """Two prunings of a short run take 20 steps: 30 in seven tenths of it leave 12, in three tenths 70."""
-    monkeypatch.setattr(octree_trainer, "COVERAGE", 0)
+    monkeypatch.setattr(octree_schedule, "COVERAGE", 0)
     config = OctreeConfig(levels=[3, 4], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 2])
     steps_taken(monkeypatch)
     tuner = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
@@ -270,7 +270,7 @@ def test_a_coarse_stage_splits_what_holds_the_error(tiny_scene):
 @pytest.mark.parametrize("share, leaves", [(0.0, 512), (0.99, 512 + 6 * 7)])
 def test_a_stage_grows_where_the_error_is(tiny_scene, monkeypatch, share, leaves):
     """At its prunings, also where there is nothing to prune, once each time and where asked for; and then looks again."""
-    monkeypatch.setattr(octree_trainer, "COVERAGE", 0)
+    monkeypatch.setattr(octree_schedule, "COVERAGE", 0)
     config = OctreeConfig(
         levels=[3, 5], downscales=[4, 4], stage_ends=[0.1, 1.0], tiles=[8, 8], prunes=[0, 1], prune_steps=1,
         coarse_error=0.0, growing_error=share,

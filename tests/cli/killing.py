@@ -1,0 +1,62 @@
+"""Runs a command and kills it, for test_killed.py: python killing.py SEED FIRST FOLDER COMMAND... [--then COMMAND...]
+
+In the commands OUT is a folder: once FOLDER/whole, which is left in peace, then two more, where the command gets SIGKILL or
+SIGTERM at random moments, three times each at most, and is begun again until it ends by itself; the second command is taken
+once there is OUT/FIRST. Prints how often it was killed. Children are forked, so that importing costs its seconds once.
+"""
+
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+
+import data_synth.cli  # noqa: F401  # what the commands import
+import nerfvol.measure.scores
+import nerfvol.training.train  # noqa: F401
+from nerfvol.cli.main import main
+
+
+def attempt(command: str, after: float | None, number: int) -> bool:
+    """Whether the command ended by itself and well; it is sent the signal ``number`` ``after`` so many seconds."""
+    child = os.fork()
+    if child == 0:
+        quiet = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1):
+            os.dup2(quiet, stream)
+        os._exit(main(command.split()))
+    deadline = None if after is None else time.monotonic() + after
+    while True:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status) == 0
+        if deadline is not None and time.monotonic() >= deadline:
+            os.kill(child, number)
+            deadline = None
+        time.sleep(0.002)
+
+
+def run() -> None:
+    seed, first, folder, *argv = sys.argv[1:]
+    rng = random.Random(seed)
+    begin, _, resume = " ".join(argv).partition(" --then ")
+    began = time.monotonic()
+    if not attempt(begin.replace("OUT", f"{folder}/whole"), None, 0):
+        sys.exit("the command does not end well even undisturbed")
+    seconds, killed = time.monotonic() - began, 0
+    for k in (1, 2):
+        out = f"{folder}/killed_{k}"
+        for left in (3, 2, 1, 0):
+            command = resume if resume and Path(out, first).exists() else begin
+            after = rng.uniform(0, 1.5 * seconds / left) if left else None
+            if attempt(command.replace("OUT", out), after, rng.choice((signal.SIGKILL, signal.SIGTERM))):
+                break
+            killed += 1
+        else:
+            sys.exit(f"{command} does not end")
+    print(killed)
+
+
+if __name__ == "__main__":
+    run()
