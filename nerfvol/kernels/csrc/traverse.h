@@ -54,28 +54,26 @@ inline Range range_of(Interval s, const Pyramid::Grid& g) {
     return {__builtin_convertvector(first, i8v), __builtin_convertvector(last, i8v)};
 }
 
-// The patches, as bits, inside the columns and rows of each of eight children (all for a child that is near), among `patches`.
-// Returns one bit for each child that has any.
-inline uint32_t patches_inside(Range columns, Range rows, i8v near, uint64_t patches, uint64_t* inside) {
+// The patches, as bits, inside the columns and rows of each of eight children, among `patches`. Returns one bit for each child
+// that has any.
+inline uint32_t patches_inside(Range columns, Range rows, uint64_t patches, uint64_t* inside) {
     const i8v bits = (255 << columns.first) & (255 >> (7 - columns.last));
 #if defined(__AVX512F__)
     const u8l every = {~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull, ~0ull};
     const u8l from = every << __builtin_convertvector(8 * rows.first, u8l);
     const u8l to = every >> __builtin_convertvector(56 - 8 * rows.last, u8l);
-    const u8l met = (((__builtin_convertvector(bits, u8l) * 0x0101010101010101ull) & from & to) |
-                     (u8l)__builtin_convertvector(near, l8)) & patches;
+    const u8l met = (__builtin_convertvector(bits, u8l) * 0x0101010101010101ull) & from & to & patches;
     store(inside, met);
     return mask_bits(__builtin_convertvector((l8)(met != 0), i8v));
 #else
-    int32_t in_columns[8], first[8], last[8], close[8];
+    int32_t in_columns[8], first[8], last[8];
     store(in_columns, bits);
     store(first, rows.first);
     store(last, rows.last);
-    store(close, near);
     uint32_t some = 0;
     for (int k = 0; k < 8; ++k) {
         const uint64_t in_rows = (~0ull << 8 * first[k]) & (~0ull >> (56 - 8 * last[k]));
-        inside[k] = ((uint64_t(uint32_t(in_columns[k])) * 0x0101010101010101ull & in_rows) | uint64_t(int64_t(close[k]))) & patches;
+        inside[k] = uint64_t(uint32_t(in_columns[k])) * 0x0101010101010101ull & in_rows & patches;
         some |= uint32_t(inside[k] != 0) << k;
     }
     return some;
@@ -144,13 +142,13 @@ private:
             const float c[3] = {centre[0] - 0.5f * h, centre[1] - 0.5f * h, centre[2] - 0.5f * h};
             const f8 a = dot3(c, p_.u) + h * off_u_, b = dot3(c, p_.v) + h * off_v_, w = dot3(c, p_.axis) + h * off_w_;
             const f8 w_near = w - (r_w_ * h + 1e-6f), w_far = w + (r_w_ * h + 1e-6f);
-            const i8v near = w_near < splat8(0.02f * h);  // too close for a bound on their slopes
-            const f8 near_inverse = 1.0f / w_near, far_inverse = 1.0f / w_far;
+            // A child that reaches behind the origin has no nearest depth: its slopes end where it crosses the axis, or nowhere.
+            const f8 near_inverse = w_near < splat8(0.02f * h) ? splat8(1e20f) : 1.0f / w_near, far_inverse = 1.0f / w_far;
             const Interval su = slopes(a, r_u_ * h + 1e-6f, near_inverse, far_inverse);
             const Interval sv = slopes(b, r_v_ * h + 1e-6f, near_inverse, far_inverse);
-            const uint32_t some = patches_inside(range_of(su, p_.columns), range_of(sv, p_.rows), near, patches, inside);
+            const uint32_t some = patches_inside(range_of(su, p_.columns), range_of(sv, p_.rows), patches, inside);
             const i8v meets = (su.hi >= p_.u_min) & (su.lo <= p_.u_max) & (sv.hi >= p_.v_min) & (sv.lo <= p_.v_max);
-            present &= some & mask_bits((near | meets) & (w_far > 0.0f));
+            present &= some & mask_bits(meets & (w_far > 0.0f));
         }
         const uint32_t first = (centre[0] <= 0 ? 4u : 0u) | (centre[1] <= 0 ? 2u : 0u) | (centre[2] <= 0 ? 1u : 0u);
         uint32_t waiting = flipped(present, first);  // bit k: the k-th child on the way
