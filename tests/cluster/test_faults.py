@@ -156,9 +156,9 @@ def scheduler_of(folder: Path) -> Iterator[tuple[str, Callable[..., subprocess.P
     starter = "import sys; from distributed.cli.dask_{0} import main; main(sys.argv[1:])"
     with contextlib.ExitStack() as stack:
 
-        def start(what: str, *given: str, **variables: str) -> subprocess.Popen:
+        def start(what: str, *given: str, before: str = "", **variables: str) -> subprocess.Popen:
             given = (*given, "--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file))
-            process = subprocess.Popen([sys.executable, "-c", starter.format(what), *given], cwd=ROOT,
+            process = subprocess.Popen([sys.executable, "-c", before + starter.format(what), *given], cwd=ROOT,
                                        stderr=subprocess.DEVNULL, env={**os.environ, **variables})  # fmt: skip
             stack.enter_context(process)
             stack.callback(process.kill)
@@ -188,6 +188,26 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
         assert len(fit.fit_workers(found, resource)) == 1
         assert drawn_by(found, model, tmp_path / "out") == FRAMES
     assert contents(tmp_path / "out") == expected
+
+
+def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
+    absent = "import sys; sys.modules['nerfvol'] = None; "
+    with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
+        worker(before=absent)
+        found.wait_for_workers(1, timeout=60)
+        (stranger,) = found.scheduler_info(n_workers=-1)["workers"]
+        with pytest.raises(
+            InputError, match=rf"is fit after 2 s \({stranger}: nerfvol cannot be used there \(ModuleNotF"
+        ):
+            fit.welcome(found, Needs(patience=2.0))
+        worker()
+        found.wait_for_workers(2, timeout=60)
+        window = Window(found, Job("tests.cluster.work:double", {}), Needs())
+        assert [
+            said for said in window.messages if said.startswith(f"{stranger} does not work on this: nerfvol cannot")
+        ]
+        assert len(window.messages) == 1
+        assert [value for value, _ in window.results(range(8))] == [2 * k for k in range(8)]
 
 
 def test_a_worker_that_joins_late_works_too(tmp_path):
