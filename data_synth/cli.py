@@ -111,7 +111,7 @@ def main(argv: list[str], each: Each | None = None) -> int:
             if args.scene == "list":
                 return _list(argv)
             with say_when_compiling():
-                return _render(args, each)
+                return _render(args, argv, each)
     except InputError as error:
         print(f"nerfvol synth: {error}", file=sys.stderr)
         return 2
@@ -221,7 +221,7 @@ def _chosen(text: str | None) -> tuple[int, int, int] | None:
     return first, last, step
 
 
-def _render(args: argparse.Namespace, each: Each | None) -> int:
+def _render(args: argparse.Namespace, argv: list[str], each: Each | None) -> int:
     if bool(args.out) == bool(args.picture):
         got = "both" if args.out else "nothing"
         raise InputError(f"--out, --picture: expected a folder to write or one portrait, got {got}")
@@ -235,8 +235,7 @@ def _render(args: argparse.Namespace, each: Each | None) -> int:
         raise InputError(f"--suns: expected --out with it, and no {'--picture' if args.picture else '--light'}")
     if args.denoise and not args.picture:
         raise InputError("--denoise: expected --picture with it; data sets are truth, and that is what is rendered")
-    scene = _scene(args)
-    integrator = _integrator(args, scene)
+    _, scene, integrator = _opened(tuple(argv))
     if args.picture:
         return _portrait(scene, integrator, options.size, args, each)
 
@@ -264,12 +263,13 @@ def _opened(argv: tuple[str, ...]) -> tuple[argparse.Namespace, Renderable, Inte
 
 
 def probe(what: str) -> bytes:
-    """What tells machines apart that would render other bytes: a small picture of the scene "NAME:INTEGRATOR".
+    """What tells machines apart that would render other bytes: a small picture of the scene "NAME:INTEGRATOR", made coarsely.
 
     Of a scene file, whose name is not one of the scenes', the sphere by its path tracer.
     """
     name, _, integrator = what.partition(":")
-    scene = scenes.make(name if name in scenes.SCENES else "sphere")
+    name = name if name in scenes.SCENES else "sphere"
+    scene = scenes.make(name, **_smallest(scenes.parameters_of(name)))
     chosen = integrators.make(integrator or scene.integrators[0]) if isinstance(scene, Scene) else None
     picture = render_view(scene, scene.viewpoints.camera(30.0, 20.0, 8, 6), chosen, 1)
     return picture.rgb.tobytes() + encode_png(picture.rgba8(1.0))

@@ -95,7 +95,7 @@ def _strangers(client: Client) -> dict[str, str]:
     """Workers on which this package, or one like it, is not installed, with the reason."""
     answers = cast("dict[str, Any]", client.run(description, on_error="return"))
     return {
-        address: f"nerfvol cannot be used there ({type(answer).__name__}: {answer})"
+        address: f"nerfvol cannot be used there ({answer})"  # the engine hands on an exception's repr in one of its own
         for address, answer in answers.items()
         if isinstance(answer, BaseException)
     }

@@ -57,6 +57,7 @@ class Window:
         self._id = uuid.uuid4().hex[:8]
         self._times: list[float] = []
         self._fit: list[str] = []
+        self._known: set[str] = set()
         self._silent: set[str] = set()
         self._asked = -1e9
         self._tasks: dict[Fetch[Any], _Task] = {}
@@ -69,6 +70,7 @@ class Window:
         """
         ready: dict[int, Done] = {}
         submitted, yielded = 0 if ahead is None else self._taken_over(ahead), 0
+        self._known.update(self._workers())
         try:
             while yielded < len(items):
                 while (
@@ -82,6 +84,7 @@ class Window:
                     if first >= yielded:
                         ready[first] = done
                         self._forget_tries_of(first)
+                self._repeat_what_found_nobody(items)
                 self._repeat_a_late_one(items, yielded)
                 while yielded in ready:
                     results = ready.pop(yielded).results
@@ -185,6 +188,23 @@ class Window:
                 f"item {task.first} fails on the cluster's workers: {type(error).__name__}: {error}"
             ) from error
         self._submit(items, task.first, task.last, task.attempts + 1)
+
+    def _repeat_what_found_nobody(self, items: Sequence[Any]) -> None:
+        """Gives out again what nobody has once somebody new is fit: a task that was given out while nobody was, or whose only
+        worker died, is not looked at again by the scheduler when a resource is added to a worker that it knows."""
+        came = not self._known.issuperset(self._workers())
+        self._known.update(self._fit)
+        if not came:
+            return
+        try:
+            processing = cast(dict[str, Any], self.client.processing())
+        except (OSError, KeyError, ValueError) as error:
+            raise self._gone() from error
+        busy = {key for keys in processing.values() for key in keys}
+        for fetch, task in list(self._tasks.items()):
+            if task.future is not None and task.future.status == "pending" and task.future.key not in busy:
+                self._release(fetch, self._tasks.pop(fetch))
+                self._submit(items, task.first, task.last, task.attempts)
 
     def _repeat_a_late_one(self, items: Sequence[Any], oldest: int) -> None:
         """The oldest items that are missing are given out once more after five times what they take: who has them is frozen,

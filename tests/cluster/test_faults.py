@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.cluster import fit, ship
+from nerfvol.cluster import engine, fit, ship
 from nerfvol.cluster.engine import connect
 from nerfvol.cluster.frames import MODEL, OnCluster
 from nerfvol.cluster.needs import Needs
@@ -116,6 +117,20 @@ def test_a_worker_killed_in_any_phase_loses_nothing_and_does_nothing_twice(
     assert contents(out) == expected and len(written) == len(set(written)) == FRAMES
 
 
+@pytest.mark.parametrize("copies", (True, False), ids=("copies", "processes"))
+def test_when_the_only_worker_is_killed_its_successor_goes_on(copies, monkeypatch):
+    """The scheduler does not look again at tasks that nobody could take when a worker it knows becomes fit; and nothing is late
+    while nobody knows how long a task takes."""
+    monkeypatch.setattr(engine, "may_copy", lambda: copies)
+    with connect("local:1") as found:
+        window = Window(found, Job("tests.cluster.work:double", {"seconds": 0.8}), Needs())
+        (process,) = found.run(os.getpid).values()
+        threading.Timer(0.4, os.kill, (process, signal.SIGKILL)).start()
+        results = list(window.results(range(3)))
+    assert [value for value, _ in results] == [0, 2, 4]
+    assert process not in {who for _, who in results}
+
+
 def test_a_client_that_was_killed_goes_on_with_the_same_command(model, expected, tmp_path):
     code = (
         "import sys\nfrom pathlib import Path\nfrom tests.cluster import test_faults as t\n"
@@ -135,15 +150,15 @@ def test_a_client_that_was_killed_goes_on_with_the_same_command(model, expected,
 
 
 @contextlib.contextmanager
-def engine(folder: Path) -> Iterator[tuple[str, Callable[..., subprocess.Popen]]]:
+def scheduler_of(folder: Path) -> Iterator[tuple[str, Callable[..., subprocess.Popen]]]:
     """A scheduler file of a scheduler started by command, and what starts workers of it with given environments."""
     file = folder / "scheduler.json"
     starter = "import sys; from distributed.cli.dask_{0} import main; main(sys.argv[1:])"
     with contextlib.ExitStack() as stack:
 
-        def start(what: str, *given: str, **variables: str) -> subprocess.Popen:
+        def start(what: str, *given: str, before: str = "", **variables: str) -> subprocess.Popen:
             given = (*given, "--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(file))
-            process = subprocess.Popen([sys.executable, "-c", starter.format(what), *given], cwd=ROOT,
+            process = subprocess.Popen([sys.executable, "-c", before + starter.format(what), *given], cwd=ROOT,
                                        stderr=subprocess.DEVNULL, env={**os.environ, **variables})  # fmt: skip
             stack.enter_context(process)
             stack.callback(process.kill)
@@ -161,7 +176,7 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
 
     if ops.isa() not in ("avx2", "avx512"):
         pytest.skip(f"these kernels are {ops.isa()}: there is nothing to tell them from")
-    with engine(tmp_path) as (file, worker), connect(file) as found:
+    with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
         worker(NERFVOL_ISA="baseline")
         found.wait_for_workers(1, timeout=60)
         with pytest.raises(InputError, match=r"is fit after 3 s \(tcp://.*with baseline kernels.*draws other pictures"):
@@ -175,8 +190,28 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
     assert contents(tmp_path / "out") == expected
 
 
+def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
+    absent = "import sys; sys.modules['nerfvol'] = None; "
+    with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
+        worker(before=absent)
+        found.wait_for_workers(1, timeout=60)
+        (stranger,) = found.scheduler_info(n_workers=-1)["workers"]
+        with pytest.raises(
+            InputError, match=rf"is fit after 2 s \({stranger}: nerfvol cannot be used there \(ModuleNotF"
+        ):
+            fit.welcome(found, Needs(patience=2.0))
+        worker()
+        found.wait_for_workers(2, timeout=60)
+        window = Window(found, Job("tests.cluster.work:double", {}), Needs())
+        assert [
+            said for said in window.messages if said.startswith(f"{stranger} does not work on this: nerfvol cannot")
+        ]
+        assert len(window.messages) == 1
+        assert [value for value, _ in window.results(range(8))] == [2 * k for k in range(8)]
+
+
 def test_a_worker_that_joins_late_works_too(tmp_path):
-    with engine(tmp_path) as (file, worker), connect(file) as found:
+    with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
         worker()
         results = Window(found, Job("tests.cluster.work:double", {"seconds": 0.05}), Needs()).results(range(2000))
         seen = {next(results)[1]}
