@@ -25,8 +25,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", metavar="RUN", help="run folder: the model, config.yaml, metrics.json, log.jsonl, "
                    "previews/, checkpoint.safetensors")  # fmt: skip
     p.add_argument("--config", metavar="FILE", help="YAML file of settings, such as configs/smoke.yaml")
-    p.add_argument("--representation", metavar="auto|octree|splats|field|medium", help="auto: splats on photographs, which they "
-                   "draw sharper and sooner; the octree, which has a density, on objects and media; field: a "
+    p.add_argument("--representation", metavar="auto|octree|splats|field|medium", help="auto: splats on photographs, which "
+                   "they draw sharper and sooner; the octree, which has a density, on objects and media; field: a "
                    "small network behind a hash grid, which the others can be made of (default: auto)")  # fmt: skip
     p.add_argument("--light", metavar="FILE", help="JSON of the suns that the pictures were taken under and the phase function "
                    "(docs/relighting.md): fits extinction and albedo of a medium, which can be lit anew")  # fmt: skip
