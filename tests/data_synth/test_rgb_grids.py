@@ -21,7 +21,7 @@ from tests.fixtures.hypothesis_tests import assert_means
 
 BOX = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
 SLOPES = np.array([0.2, 1.0, 6.0])  # a factor of 30 between channels
-SUN = lights.directional((0.5, -0.7, 0.6), (3.0, 2.0, 1.0))
+SUN = lights.directional((-0.9, -0.4, 0.1), (3.0, 2.0, 1.0))  # from behind the eye
 
 
 def ramps(n: int = 11) -> np.ndarray:
@@ -103,13 +103,14 @@ def test_albedo_of_each_channel_at_each_vertex():
     medium = channels.rgb_grid(np.full((5, 5, 5, 3), 3.0), *BOX, albedo)
     seen = March().render(Scene(medium=medium, lights=[SUN]), Camera(1, 2, 1.5, look_at((-3.0, 0, 0), (0, 0, 0))))
     above, below = seen.rgb[0, 0], seen.rgb[1, 0]
-    assert above[2] > 0.01 and below[0] > 0.01 and above[1] == below[1] == 0
+    assert above[2] > 0.003 and below[0] > 0.003 and above[1] == below[1] == 0
     assert above[0] < 0.1 * below[0] and below[2] < 0.1 * above[2]
 
 
 def test_channels_have_random_numbers_of_their_own():
     medium = channels.rgb_grid(np.full((3, 3, 3, 3), 1.0), *BOX, 0.5)
-    p = Path(spp=4, jitter=False).render(Scene(medium=medium, lights=[SUN]), camera(24))
+    far = Camera(24, 24, 1e5, look_at(RAY[0], (0.0, 0.5, 0.2)))  # all pixels the same ray
+    p = Path(spp=4, jitter=False).render(Scene(medium=medium, lights=[SUN]), far)
     r, g, b = (p.rgb[..., c].ravel() for c in range(3))
     for x, y in ((r, g), (g, b), (r, b)):
         assert abs(np.corrcoef(x, y)[0, 1]) < 4.5 / np.sqrt(x.size)
@@ -118,7 +119,7 @@ def test_channels_have_random_numbers_of_their_own():
 def test_a_changed_scene_is_split_again():
     scene = Scene(medium=channels.rgb_grid(ramps(), *BOX, 0.5), lights=[SUN])
     before = March().render(scene, camera()).rgb
-    scene.lights = [lights.directional((0.5, -0.7, 0.6), (0.3, 0.2, 0.1))]
+    scene.lights = [lights.directional((-0.9, -0.4, 0.1), (0.3, 0.2, 0.1))]
     np.testing.assert_allclose(March().render(scene, camera()).rgb, before / 10, rtol=1e-9)
 
 

@@ -115,7 +115,8 @@ def test_reciprocity():
         f, g = there[side, 0] / np.abs(wi[side, 2]), back[:, 0] / np.abs(wo[side, 2])
         factor = eta * eta if own != eta else 1.0
         assert (f > 0).sum() > 200
-        np.testing.assert_allclose(factor * f, g, rtol=1e-9, atol=1e-300)
+        # eta wo + wi nearly cancels at worst to 1e-4 of its terms, and D has its square
+        np.testing.assert_allclose(factor * f, g, rtol=1e-7, atol=1e-300)
 
 
 @pytest.mark.parametrize("eta, cosine", [(1 / 1.5, 0.9), (1 / 1.5, 0.2), (1.5, 0.9), (1.5, 0.3)])
@@ -152,7 +153,7 @@ def test_slab_of_tinted_glass_in_front_of_the_ground(roughness, cosine):
     runs = [Path(spp=400, jitter=False).render(scene, looking_down(cosine), seed=k).rgb[0, 0] for k in range(25)]
     p = np.array(runs)
     assert_means(p.mean(0), p.var(0, ddof=1) / len(p), want, bias=1e-5)
-    marched = March(beams=1).render(scene, looking_down(cosine)).rgb[0, 0]
+    marched = March(beams=2).render(scene, looking_down(cosine)).rgb[0, 0]
     np.testing.assert_allclose(marched, TINT**2 * (1 - R), rtol=1e-6)  # where light leaves all of it goes on
 
 
