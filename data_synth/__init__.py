@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera", "DeepShadow", "Emission", "InputError", "March", "Options", "Path", "Picture", "Preview", "RenderWarning",
-    "Scene", "Viewpoints", "clouds", "lights", "load_scene", "look_at", "materials", "media", "phase", "read_exr", "render",
-    "render_view", "sample_flights", "sample_transmittance", "scenes", "sggx", "spongecake", "surfaces",
+    "Scene", "Viewpoints", "channels", "clouds", "lights", "load_scene", "look_at", "materials", "media", "phase", "read_exr",
+    "render", "render_view", "sample_flights", "sample_transmittance", "scenes", "sggx", "spongecake", "surfaces",
     "volumes", "write_dataset", "write_exr", "write_png",
 ]  # fmt: skip
 

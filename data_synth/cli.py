@@ -18,12 +18,14 @@ import numpy as np
 
 from data_synth import integrators, scene_file, scenes
 from data_synth.cameras import Camera
+from data_synth.channels import Channels
 from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError, RenderWarning
 from data_synth.files import remove_leftovers
 from data_synth.image import Picture, encode_png, write_png
 from data_synth.integrators import Integrator
 from data_synth.jit import say_when_compiling
+from data_synth.media import Medium
 from data_synth.portrait import portrait
 from data_synth.scene import Scene
 from data_synth.views import (
@@ -193,9 +195,13 @@ def _scene(args: argparse.Namespace) -> Renderable:
             raise InputError(f"--step: expected a positive length, got {args.step:g}")
         if not isinstance(scene, Scene) or scene.medium is None:
             raise InputError(f"--step: {scene.name} has no medium to march through")
-        scene.medium = scene.medium._replace(step=args.step)
-        scene.media = [m._replace(step=args.step) for m in scene.media]
+        scene.medium = _with_step(scene.medium, args.step)
+        scene.media = [_with_step(m, args.step) for m in scene.media]
     return scene
+
+
+def _with_step(m: Medium | Channels, step: float) -> Medium | Channels:
+    return m.with_step(step) if isinstance(m, Channels) else m._replace(step=step)
 
 
 def _integrator(args: argparse.Namespace, scene: Renderable) -> Integrator | None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from data_synth import compiled, gather, march, parts, path, shadowmap
+from data_synth import channels, compiled, gather, march, parts, path, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.gather import Gathered
@@ -80,6 +80,8 @@ class March:
 
     def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
         """See Integrator; rgb, alpha, distance."""
+        if (scenes := scene.in_channels()) is not None:
+            return channels.rendered(scenes, seed, lambda one, own: self.sums(one, camera, own, part))
         world, maps, gathered = _prepared(self, scene)
         eye, mode, rho_J = camera.c2w[:3, 3], self.mode, np.empty(0, np.float32)
         if gathered is not None:
@@ -177,6 +179,8 @@ class Path:
 
     def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
         """See Integrator; over the samples, of rgb, alpha, distance and the squares of rgb."""
+        if (scenes := scene.in_channels()) is not None:
+            return channels.rendered(scenes, seed, lambda one, own: self.sums(one, camera, own, part))
         world = _prepared(self, scene).world
         depth = UNLIMITED if self.max_depth is None else self.max_depth
         settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed, part.first, part.last)

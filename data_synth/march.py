@@ -199,11 +199,14 @@ def march_ray(w, lighting, ray, inside, opaque_sky, rng):
         if row[0] == NULL:
             inside = crossing(row, inside, dot(d, n) < 0.0)
         elif row[0] == DIELECTRIC:
-            d, inside, reflectance, bent = enter_glass(w, material, n, wo, inside)
+            d, behind, reflectance, bent = enter_glass(w, material, n, wo, inside)
+            mirrored, inside = dot(d, n) * dot(wo, n) > 0.0, behind  # all of it, inside
             if bent:
                 far += mean(T) * (base + t) if straight else 0.0
                 L = add(L, mul(scale(reflectance, T), escaped(w.sky, materials.mirrored(n, wo))))
                 T, straight = scale(1.0 - reflectance, T), False
+            if not mirrored:
+                T = mul(T, materials.tint_of(row))
         else:
             if lighting.mode != UNLIT:
                 L = add(L, mul(T, lit_surface(w, lighting, p, n, material, wo, inside, rng)))

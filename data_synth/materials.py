@@ -1,8 +1,9 @@
 """What surfaces do to light (PHYSICS 9). A material table is a (n, 16) float array with rows made below.
 
-Columns: kind, albedo (1-3), second albedo of a checker (4-6), edge of its squares (7, 0 = none), gloss (8), exponent
-(9), index of refraction (10), first and last row in the layer table (11, 12), and of boundaries the number of the
-medium inside (13), the priority (14) and, in a world, the place of their counter (15, -1 = none; see ``world.py``).
+Columns: kind, albedo (1-3; of boundaries the tint), second albedo of a checker (4-6), edge of its squares (7, 0 = none), gloss
+(8; of boundaries the roughness), exponent (9), index of refraction (10), first and last row in the layer table (11, 12), and of
+boundaries the number of the medium inside (13), the priority (14) and, in a world, the place of their counter (15, -1 = none;
+see ``world.py``).
 All directions point outward; n is the geometric normal, out of closed shapes.
 """
 
@@ -22,6 +23,7 @@ from data_synth.rng import uniform
 from data_synth.vec import add, cross, dot, from_frame, mul, neg, scale, sphere_direction, sub, unit
 
 LAMBERT, BLINN_PHONG, SPONGECAKE, DIELECTRIC, NULL = range(5)
+SMOOTHEST = 1e-4  # GGX's alpha, below which its peak has no digits left
 CLEAR, UNSAID = -1, -2  # no medium inside; the scene decides
 
 
@@ -46,8 +48,13 @@ def blinn_phong(
     return row
 
 
-def dielectric(ior: float, medium: int | None = None, priority: float = 0.0) -> np.ndarray:
-    """A clear, smooth boundary: it reflects and refracts. ior: the index of refraction inside; outside of all it is 1.
+def dielectric(
+    ior: float, medium: int | None = None, priority: float = 0.0, roughness: float = 0.0, tint: ArrayLike = 1.0
+) -> np.ndarray:
+    """A boundary that reflects and refracts. ior: the index of refraction inside; outside of all it is 1.
+
+    roughness: GGX's alpha, 0 (smooth) to 1 (``rough.py``); marching knows smooth boundaries alone, and draws this as one.
+    tint: RGB fraction in [0, 1] of the light that goes through which is left, at each crossing; what is mirrored is not tinted.
 
     medium: the number of the medium inside, ``CLEAR`` for none; None: as the scene says. priority: where closed
     boundaries overlap the highest counts, of equal ones the later material (Schmidt & Budge 2002). Boundaries must not
@@ -58,8 +65,10 @@ def dielectric(ior: float, medium: int | None = None, priority: float = 0.0) -> 
     """
     if not ior > 0:
         raise InputError(f"dielectric: ior must be positive, got {ior}")
+    if not 0 <= roughness <= 1:
+        raise InputError(f"dielectric: roughness must be in [0, 1], got {roughness}")
     row = _boundary(DIELECTRIC, medium, priority)
-    row[10] = ior
+    row[10], row[1:4], row[8] = ior, rgb(tint, "tint", 1.0), max(roughness, SMOOTHEST) if roughness > 0 else 0.0
     return row
 
 
@@ -99,6 +108,12 @@ def albedo_at(row, p):
         odd = math.floor(p[0] * e + 1e-6) + math.floor(p[1] * e + 1e-6) + math.floor(p[2] * e + 1e-6)
         if odd % 2.0 != 0.0:
             return (row[4], row[5], row[6])
+    return (row[1], row[2], row[3])
+
+
+@jit
+def tint_of(row):
+    """What is left of light that goes through a boundary, besides what it mirrors."""
     return (row[1], row[2], row[3])
 
 

@@ -14,7 +14,7 @@ surface or lamp, or bent by glass: the distance is the mean over these ends.
 
 from typing import NamedTuple
 
-from data_synth import equiangular, materials, phase
+from data_synth import equiangular, materials, phase, rough
 from data_synth.cameras import pixel_ray
 from data_synth.jit import jit, kernel
 from data_synth.lights import POINT, column3, escaped, quad_pdf, quad_radiance, sample_light
@@ -23,7 +23,7 @@ from data_synth.media import attribute, box_interval, extinction, lookup
 from data_synth.parts import BLOCK
 from data_synth.rng import reseed, uniform
 from data_synth.traverse import collisions, traversal
-from data_synth.vec import add, along, dot, largest, mean, mul, neg, scale, sub
+from data_synth.vec import add, along, dot, largest, mean, mul, neg, scale, sub, unit
 from data_synth.world import RANDOM, crossing, index_at, inside_at, medium_of, next_surface, number_at, visible
 
 ROULETTE_DEPTH = 6
@@ -152,18 +152,52 @@ def found_light(w, ray, t, quad, pdf_last):
 
 @jit
 def through_glass(w, material, n, wo, inside, rng):
-    """(direction, ``inside``, whether it was bent) behind a null or dielectric boundary, mirrored by chance."""
-    row = w.materials.rows[material]
+    """(direction, ``inside``, weight, whether it was bent, pdf) behind a null or dielectric boundary, mirrored by chance. The
+    density of the direction is 0 where it is a delta."""
+    row, tint = w.materials.rows[material], materials.tint_of(w.materials.rows[material])
     behind = crossing(row, inside, dot(wo, n) > 0.0)
     if row[0] != DIELECTRIC:
-        return neg(wo), behind, False
+        return neg(wo), behind, (1.0, 1.0, 1.0), False, 0.0
     here, there = index_at(w, inside), index_at(w, behind)
     if here == there:
-        return neg(wo), behind, False
+        return neg(wo), behind, tint, False, 0.0
+    if row[8] > 0.0:
+        local, weight, pdf, through = rough.sample(row[8], here / there, materials.to_local(n, wo), rng)
+        s, t = materials.spongecake_frame(n)
+        wi = unit(add(add(scale(local[0], s), scale(local[1], t)), scale(local[2], n)))
+        if through:
+            return wi, behind, scale(weight, tint), True, pdf
+        return wi, inside, (weight, weight, weight), True, pdf
     wi, reflectance = materials.refracted(n, wo, here / there)
     if uniform(rng) < reflectance:
-        return materials.mirrored(n, wo), inside, True
-    return wi, behind, True
+        return materials.mirrored(n, wo), inside, (1.0, 1.0, 1.0), True, 0.0
+    return wi, behind, tint, True, 0.0
+
+
+@jit
+def at_rough_glass(w, v, inside, beta, rng):
+    """``next_event`` for a rough boundary: light from either side."""
+    row = w.materials.rows[v.material]
+    behind = crossing(row, inside, dot(v.wo, v.n) > 0.0)
+    here, there = index_at(w, inside), index_at(w, behind)
+    if here == there:
+        return (0.0, 0.0, 0.0)
+    count = w.lights.shape[0]
+    k = min(int(uniform(rng) * count), count - 1)
+    wi, distance, radiance, pdf = sample_light(w.lights, k, v.p, rng)
+    local = materials.to_local(v.n, v.wo), materials.to_local(v.n, wi)
+    value, pdf_other, through = rough.parts(row[8], here / there, local[0], local[1])
+    weight = scale(value, beta)
+    if through:
+        weight = mul(weight, materials.tint_of(row))
+    contribution = mul(weight, radiance)
+    if largest(contribution) <= 0.0:
+        return (0.0, 0.0, 0.0)
+    mis = float(count)
+    if pdf > 0.0:
+        mis *= pdf / (pdf + count * pdf_other)
+    side = behind if through else inside
+    return scale(mis, mul(contribution, visible(w, (v.p, wi), distance * (1.0 - 1e-9), side, RANDOM, rng)))
 
 
 @jit
@@ -218,11 +252,17 @@ def trace_path(w, ray, inside, settings, rng):
         p, wo = along(ray, t), neg(ray[1])
         base, since = base + t, since + t
         if material >= 0 and w.materials.rows[material, 0] >= DIELECTRIC:
-            wi, inside, bent = through_glass(w, material, n, wo, inside, rng)
+            if lit and w.materials.rows[material, 8] > 0.0 and largest(beta) > 0.0:
+                L = add(L, at_rough_glass(w, Vertex(p, wo, n, material, number, ray, t, t0, t1), inside, beta, rng))
+            wi, inside, weight, bent, pdf = through_glass(w, material, n, wo, inside, rng)
             if bent:
                 if straight:
                     far += mean(beta) * base
-                straight, pdf_last = False, 0.0
+                straight, pdf_last = False, pdf
+                since = 0.0 if pdf > 0.0 else since
+            beta = mul(beta, weight)
+            if largest(beta) <= 0.0 and not straight:
+                break
             ray = (p, wi)
             continue
         v = Vertex(p, wo, n, material, number, ray, t, t0, t1)

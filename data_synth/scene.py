@@ -16,6 +16,7 @@ from data_synth import lights as lamps
 from data_synth import materials as stuff
 from data_synth import media, surfaces, truth, volumes
 from data_synth.cameras import Camera, Viewpoints
+from data_synth.channels import Channels, split
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
 from data_synth.integrators import Integrator, Prepared, make
@@ -40,7 +41,7 @@ class Scene:
     """
 
     name: str = "scene"
-    medium: media.Medium | None = None
+    medium: media.Medium | Channels | None = None
     shapes: list = field(default_factory=list)
     triangles: np.ndarray | None = None
     materials: list = field(default_factory=list)
@@ -56,9 +57,20 @@ class Scene:
     media: list = field(default_factory=list)
     prepared: dict[object, Prepared] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What integrators keep for the next view: arrays and shadow maps, which do not depend on the camera."""
+    split: tuple[bytes, list[Scene] | None] | None = field(default=None, init=False, repr=False, compare=False)
+
+    def in_channels(self) -> list[Scene] | None:
+        """The scenes of red, green and blue where a medium has coefficients of its own for each (``channels.py``), or None."""
+        key = self.fingerprint()
+        if self.split is None or self.split[0] != key:
+            self.split = key, split(self)
+        return self.split[1]
 
     def world(self, beams: int = 0) -> World:
-        """The arrays for kernels. beams > 0 replaces sky and quad lights by that many beams each."""
+        """The arrays for kernels; not of a scene :meth:`in_channels`. beams > 0 replaces sky and quad lights by that many beams
+        each."""
+        if isinstance(self.medium, Channels) or any(isinstance(m, Channels) for m in self.media):
+            raise TypeError("a scene in channels has three worlds")
         rows = lamps.discretise(self.lights, beams) if beams else list(self.lights)
         glows = any(np.any(m.Le) for m in (self.medium, *self.media) if m is not None)
         if not rows and not glows:
@@ -122,8 +134,9 @@ class Scene:
     def write_truth(self, out_dir: Path) -> None:
         """truth.npz, all that the scene is made of; of a grid medium also density.npz and density.vdb, its extinction."""
         truth.write(self, out_dir / "truth.npz")
-        if self.medium is not None and self.medium.kind == media.GRID:
-            volumes.write_density(self.medium, out_dir)
+        green = self.medium.green if isinstance(self.medium, Channels) else self.medium
+        if green is not None and green.kind == media.GRID:
+            volumes.write_density(green, out_dir)
 
 
 def _table(rows: Sequence[ArrayLike], width: int) -> np.ndarray:

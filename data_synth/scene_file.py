@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from data_synth import clouds, lights, materials, media, phase, scenes, sggx, spongecake, surfaces, volumes
+from data_synth import channels, clouds, lights, materials, media, phase, scenes, sggx, spongecake, surfaces, volumes
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError
 from data_synth.integrators import INTEGRATORS
@@ -85,7 +85,9 @@ def layered(layers: Any) -> Any:
 
 
 KINDS: dict[str, dict[str, Callable]] = {
-    "medium": {f.__name__: f for f in (media.homogeneous, media.exponential, media.grid, volume, cloud)},
+    "medium": {f.__name__: f for f in (
+        media.homogeneous, media.exponential, media.grid, channels.rgb_grid, channels.rgb_coefficients, volume, cloud,
+    )},
     "phase": {f.__name__: f for f in (
         phase.isotropic, phase.rayleigh, phase.henyey_greenstein, phase.two_lobes,
     )} | {"microflakes": lambda S, diffuse=False: phase.microflakes(S, diffuse=diffuse)},
@@ -160,7 +162,7 @@ class _File:
             raise self.fail("integrators", f"expected a list of {', '.join(INTEGRATORS)}, got {names}")
         scene.integrators = tuple(names)
         scene.parameters = {"file": str(self.path)}
-        scene.world(1)  # checks what belongs together
+        (scene.in_channels() or [scene])[0].world(1)  # checks what belongs together
         return scene
 
     def exposure(self, top: Mapping) -> float:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from data_synth.channels import Channels
 from data_synth.errors import InputError
 from data_synth.jit import kernel
 from data_synth.media import EXPONENTIAL, HOMOGENEOUS, Medium, Point, triple
@@ -29,7 +30,7 @@ def _flights(m, ray, t1, method, local, rng, out):
 
 
 def sample_transmittance(
-    m: Medium,
+    m: Medium | Channels,
     o: Point,
     d: Point,
     t1: float = np.inf,
@@ -38,10 +39,15 @@ def sample_transmittance(
     n: int = 1,
     seed: int = 0,
 ) -> np.ndarray:
-    """(n, 3) independent estimates of the RGB transmittance from o over a distance t1 along unit d.
+    """(n, 3) independent estimates of the RGB transmittance from o over a distance t1 along unit d; of a medium in channels
+    each has random numbers of its own.
 
     method: a row of the table in ``trackers.py``. local: one majorant per brick instead of one for all.
     """
+    if isinstance(m, Channels):
+        return np.stack(
+            [sample_transmittance(one, o, d, t1, method, local, n, 3 * seed + c)[:, c] for c, one in enumerate(m)], 1
+        )
     out = np.empty((n, 3))
     _transmittances(m, _ray(o, d), float(t1), _method(m, method, METHODS), bool(local), new_rng(seed, 0), out)
     return out

@@ -6,6 +6,7 @@
 | ``mediumK_lo``, ``_hi``                 | its box                                                                     |
 | ``mediumK_sigma_t``                     | (3,) extinction per density in 1/u                                          |
 | ``mediumK_density``, ``_attribute``     | samples at the vertices of a grid from lo to hi; the attribute only if any  |
+| ... of kind rgb_grid                    | density and albedo are (nx, ny, nz, 3): extinction in 1/u, and albedo       |
 | ``mediumK_height``                      | exponential: density exp(-(z - lo_z) / height)                              |
 | ``mediumK_albedo``, ``_Le``             | (n, 3) tables over the attribute in [0, 1], linear in between               |
 | ``mediumK_phase``, ``_g``, ``_S``       | its name; g1, g2 and the weight of the first lobe; (n, 6) SGGX matrices     |
@@ -23,6 +24,7 @@ import numpy as np
 
 from data_synth import materials as stuff
 from data_synth import media, surfaces
+from data_synth.channels import Channels
 from data_synth.files import replacing
 
 if TYPE_CHECKING:
@@ -38,7 +40,8 @@ def write(scene: Scene, path: Path) -> None:
     arrays: dict[str, np.ndarray] = {}
     for k, m in enumerate((scene.medium, *scene.media)):
         if m is not None:
-            arrays |= {f"medium{k}_{name}": np.asarray(value) for name, value in _medium(m).items()}
+            described = _channels(m) if isinstance(m, Channels) else _medium(m)
+            arrays |= {f"medium{k}_{name}": np.asarray(value) for name, value in described.items()}
     lo, hi, number = numbers(scene)
     geometry = surfaces.geometry(scene.shapes, scene.triangles)
     arrays |= {
@@ -48,6 +51,12 @@ def write(scene: Scene, path: Path) -> None:
     }  # fmt: skip
     with replacing(path) as temporary:
         np.savez_compressed(temporary, allow_pickle=False, **arrays)
+
+
+def _channels(m: Channels) -> dict[str, object]:
+    grids = {"density": m, "albedo": [one._replace(samples=one.attributes) for one in m]}
+    own = {name: np.stack([media.dense(one) for one in media_], -1) for name, media_ in grids.items()}
+    return _medium(m.red) | own | {"kind": "rgb_grid", "Le": m.Le, "attribute": np.zeros(0)}
 
 
 def _medium(m: media.Medium) -> dict[str, object]:

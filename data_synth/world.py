@@ -22,7 +22,7 @@ from data_synth.pool import Media, medium_at
 from data_synth.spongecake import attenuation
 from data_synth.surfaces import Geometry, contains, hit_mesh, intersect
 from data_synth.trackers import shadow_transmittance
-from data_synth.vec import along, cross, dot, largest, mul, neg
+from data_synth.vec import along, cross, dot, largest, mul, neg, scale
 
 COUNTERS = 15  # boundary materials of one scene: four bits each
 RANDOM, MARCHED, SURFACES = range(3)  # how ``visible`` treats what is in between
@@ -124,7 +124,7 @@ def medium_of(w, number):
 
 @jit
 def kept_behind(w, k, d, n, inside, mode):
-    """(fraction of light that goes straight on through a surface of material k along d, ``inside`` behind it).
+    """(RGB fraction of light that goes straight on through a surface of material k along d, ``inside`` behind it).
 
     Glass lets shadow rays of the march pass straight, less what it reflects; in path tracing light behind glass is found
     by the paths themselves, and shadow rays end at it.
@@ -132,19 +132,20 @@ def kept_behind(w, k, d, n, inside, mode):
     row = w.materials.rows[k]
     kind = row[0]
     if kind == SPONGECAKE:
-        return attenuation(w.materials.layers, int(row[11]), int(row[12]), stuff.to_local(n, neg(d))), inside
+        kept = attenuation(w.materials.layers, int(row[11]), int(row[12]), stuff.to_local(n, neg(d)))
+        return (kept, kept, kept), inside
     if kind < DIELECTRIC:
-        return 0.0, inside
+        return (0.0, 0.0, 0.0), inside
     behind = crossing(row, inside, dot(d, n) < 0.0)
     if kind == NULL:
-        return 1.0, behind
+        return (1.0, 1.0, 1.0), behind
     here, there = index_at(w, inside), index_at(w, behind)
     if here == there:
-        return 1.0, behind
+        return stuff.tint_of(row), behind
     if mode == RANDOM:
-        return 0.0, behind
+        return (0.0, 0.0, 0.0), behind
     _, reflectance = stuff.refracted(n, neg(d), here / there)
-    return 1.0 - reflectance, behind
+    return scale(1.0 - reflectance, stuff.tint_of(row)), behind
 
 
 @jit
@@ -159,17 +160,16 @@ def visible(w, ray, t_max, inside, mode, rng):
         t, n, material = intersect(w.geometry, ray, t_max)
         if w.quads.shape[0] > 0 and hit_quad(w.quads, ray, t)[1] >= 0:
             return (0.0, 0.0, 0.0)
-        kept, behind = 1.0, inside
+        kept, behind = (1.0, 1.0, 1.0), inside
         if material >= 0:
             kept, behind = kept_behind(w, material, ray[1], n, inside, mode)
-            if kept <= 0.0:
+            if largest(kept) <= 0.0:
                 return (0.0, 0.0, 0.0)
         number = number_at(w, inside) if mode != SURFACES else -1
         if number >= 0:
             through = shadow_transmittance(medium_of(w, number), ray, t, mode == RANDOM, rng)
-            total = mul(total, (kept * through[0], kept * through[1], kept * through[2]))
-        else:
-            total = mul(total, (kept, kept, kept))
+            kept = mul(kept, through)
+        total = mul(total, kept)
         if material < 0 or largest(total) <= 0.0:
             return total
         ray, inside = (along(ray, t), ray[1]), behind

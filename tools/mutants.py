@@ -38,6 +38,8 @@ class Mutant:
 M = Mutant
 PEOPLE, MASKS, FAULTS = "datasets/test_whatever_people_bring.py", "datasets/test_masks.py", "training/test_faults.py"
 PROGRAMS, PLAIN = "datasets/test_other_programs.py", "data_synth/test_plain.py"
+ROUGH = "data_synth/test_rough.py"
+TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.py"
 MUTANTS = (
     # ---------------------------------------------------------------- cameras
     M("nerfvol/cameras/camera.py", "np.arange(width) + 0.5\n        band", "np.arange(width)\n        band", "cameras", "rays through pixels' corners"),
@@ -192,11 +194,39 @@ MUTANTS = (
     M("nerfvol/kernels/csrc/distil.cpp", "std::abs(between - own[p]) * share[p]", "std::abs(between - own[p])", "octree/test_merge.py", "colours of what is invisible keep leaves"),
     M("nerfvol/kernels/csrc/distil.cpp", "for (int z = c[2] - 1; z <= c[2] + 1; ++z)", "for (int z = c[2] - 1; z <= c[2]; ++z)", "starts/test_field.py", "neighbours on one side"),
     M("nerfvol/kernels/csrc/neighbours.cpp", "if (across * across <= found.worst()) find", "if (across * across <= 0.5 * found.worst()) find", "splats/test_ply.py starts", "the nearest behind a split"),
+    # ---------------------------------------------------------------- media under known suns
+    M("nerfvol/medium/transport.py", "planes = planes.flip(0) if towards[axis] < 0 else planes", "planes = planes", TRANSPORT, "suns from below shine from above"),
+    M("nerfvol/medium/transport.py", "per_plane = voxel[axis] / abs(towards[axis])", "per_plane = voxel[axis]", TRANSPORT, "slanted ways to the sun are as short as straight ones"),
+    M("nerfvol/medium/transport.py", "segments = 0.5 * per_plane * (straight[:-1] + straight[1:])", "segments = per_plane * straight[1:]", TRANSPORT, "depths to the light of first order"),
+    M("nerfvol/medium/transport.py", "through = torch.exp(thickness - torch.cumsum(thickness, 1))", "through = torch.exp(-torch.cumsum(thickness, 1))", TRANSPORT, "a step hides itself"),
+    M("nerfvol/medium/transport.py", "arriving = torch.exp(-found[:, 4 + k])", "arriving = torch.exp(-found[:, 4 + k].detach())", TRANSPORT, "shadows teach nothing"),
+    M("nerfvol/medium/transport.py", "arriving = torch.exp(-found[:, 4 + k])", "arriving = torch.exp(-found[:, 4])", TRANSPORT, "every sun has the first one's shadow"),
+    M("nerfvol/medium/transport.py", "q = 1 + lobe.g**2 - 2 * lobe.g * cosine", "q = 1 + lobe.g**2 + 2 * lobe.g * cosine", TRANSPORT, "forward is backward"),
+    M("nerfvol/medium/transport.py", "flip(-1), (0, 0, 0, len(points) % 2)", "flip(-1), (0, 0, 0, 0)", TRANSPORT, "odd numbers of points"),
+    M("nerfvol/medium/model.py", "beams, lobes = self.lighting.of(camera.light)", "beams, lobes = self.lighting.of(None)", "medium/test_model.py", "every picture is lit by the first light"),
+    M("nerfvol/medium/model.py", "self.sigma_t / np.float32(scale)", "self.sigma_t", "medium/test_model.py", "extinction in another unit"),
+    M("nerfvol/medium/lighting.py", "beams.append(Beam((x / length, y / length, z / length), irradiance))", "beams.append(Beam((x, y, z), irradiance))", "medium/test_model.py", "directions of any length"),
+    M("nerfvol/cameras/camera.py", "return replace(self, intrinsics=self.intrinsics.scaled(k))", "return Camera(self.intrinsics.scaled(k), self.c2w)", "medium/test_model.py", "smaller pictures forget their light"),
+    M("nerfvol/datasets/transforms.py", "light = light if isinstance(light, str) and light else None", "light = None", FITTING, "frames do not say their light"),
+    M("nerfvol/training/medium_trainer.py", "cut = (truth[:, :3] >= SATURATED) & (colour > 1)", "cut = colour > 1", FITTING, "too bright is never wrong"),
+    M("nerfvol/training/medium_trainer.py", "depth = softplus(self.density) * before / (max(shape) - 1)", "depth = softplus(self.density)", FITTING, "a finer grid is thicker"),
+    M("nerfvol/training/medium_trainer.py", "manual_seed(self.seed * 0x9E3779B1 + self.steps_done)", "manual_seed(self.seed * 0x9E3779B1)", FITTING, "every step has the same rays"),
+    M("nerfvol/training/medium_trainer.py", "manual_seed(self.seed * 0x9E3779B1 + self.steps_done)", "manual_seed(self.steps_done)", FITTING, "the seed is not looked at"),
+    M("nerfvol/training/medium_trainer.py", 'if "exp_avg_0" in state:', "if False:", FITTING, "a resumed fit has no moments"),
+    M("nerfvol/training/medium_trainer.py", "self.lighting.of(light), self.lighting.phase, step, jitter)", "self.lighting.of(None), self.lighting.phase, step, jitter)", FITTING, "all pictures train under one light"),
+    M("nerfvol/measure/truth.py", "_agreement(\n        \"opacity\", -np.expm1(-found), -np.expm1(-true)\n    )", "_agreement(\n        \"opacity\", -np.expm1(-true), -np.expm1(-true)\n    )", "training/test_medium_trainer.py measure/test_truth.py", "the truth's opacity against itself"),
     # ---------------------------------------------------------------- kernels
     M("nerfvol/kernels/csrc/adjoint.h", "g[k] = 2 * weight * residual;", "g[k] = 2 * residual;", "kernels/test_train.py", "gradients without the rays' weights"),
     M("nerfvol/kernels/csrc/train.h", "w = std::max(w, leaf.max_weight);", "w = leaf.max_weight;", "kernels/test_train.py", "the last weight of a leaf is its largest"),
     # ---------------------------------------------------------------- data_synth
     M("data_synth/phase.py", "q = 1.0 + g * g - 2.0 * g * cosine", "q = 1.0 + g * g - g * cosine", "data_synth/test_phase.py", "Henyey-Greenstein's denominator"),
+    M("data_synth/rough.py", "q = h[2] * h[2] * (a2 - 1.0) + 1.0", "q = h[2] * (a2 - 1.0) + 1.0", ROUGH, "GGX's denominator"),
+    M("data_synth/rough.py", "value = (1.0 - reflectance) * seen * -ci / (q * q)", "value = (1.0 - reflectance) * seen * -ci * eta * eta / (q * q)", ROUGH, "the side whose index counts"),
+    M("data_synth/rough.py", "return value / (1.0 + lo + li), value / (1.0 + lo), through", "return value / (1.0 + lo), value / (1.0 + lo), through", ROUGH, "nothing is hidden from the light"),
+    M("data_synth/rough.py", "b = (1.0 - k) * math.sqrt(max(1.0 - a * a, 0.0)) + k * b", "b = k * b", ROUGH, "facets that face away are drawn"),
+    M("data_synth/channels.py", "(3 * seed + c) % 2**63", "(3 * seed) % 2**63", "data_synth/test_rgb_grids.py", "one stream for all channels"),
+    M("data_synth/channels.py", "return [replace(scene, medium=one(scene.medium, c), media", "return [replace(scene, medium=one(scene.medium, 2 - c), media", "data_synth/test_rgb_grids.py", "red and blue change places"),
+    M("data_synth/channels.py", "out = sum(found[1:], found[0].copy()) / 3.0", "out = found[0].copy()", "data_synth/test_rgb_grids.py", "alpha is the red one's"),
 )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ class MediumConfig(Checked):
 
     section: ClassVar[str] = "medium"
 
-    steps: Count = 800
+    steps: Count = 400
     """Optimiser steps when no time budget is given."""
     resolutions: tuple[Annotated[int, within(4, 512)], ...] = (16, 32, 64)
     """Vertices along the longest side of the region, one a stage."""

@@ -18,6 +18,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
 from nerfvol.errors import InputError, shown
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
+from nerfvol.kernels import ops
 from nerfvol.medium.lighting import Lighting, parse_lighting
 from nerfvol.native import need_torch
 from nerfvol.octree.io import storage_of
@@ -82,6 +83,7 @@ class MediumModel:
 
         from nerfvol.medium import transport
 
+        ops.set_threads(ops.get_threads())  # torch may have been loaded only now
         colour = self.metadata.get("background", WHITE) if background is None else background
         beams, lobes = self.lighting.of(camera.light), self.lighting.phase
         parts = []
@@ -177,7 +179,7 @@ class MediumModel:
             if not isinstance(metadata, dict):
                 raise file.fault("its metadata is not a JSON object")
             try:
-                box = check_box(document.get("box"), "its box")
+                box = check_box(document.get("box", ()), "its box")
                 lighting = parse_lighting(document.get("lighting"), "its lighting")
             except InputError as error:
                 raise file.fault(str(error)) from error

@@ -179,6 +179,7 @@ def begin_medium(run: Run) -> MediumTrainer:
     need_torch("--representation medium")
     from nerfvol.training.medium_trainer import MediumTrainer
 
+    ops.set_threads(ops.get_threads())  # torch may have been loaded only now
     config, dataset = run.config, run.data.training
     if dataset.scene.is_unbounded:
         raise InputError(

@@ -116,12 +116,13 @@ def test_adjoint_against_finite_differences():
 
 def test_shadow_has_a_gradient_of_its_own():
     """Density between sun and what is seen darkens it though no ray crosses it."""
-    medium = blob((9, 9, 9), (-1.0,) * 3, (1.0,) * 3)
+    medium = blob((9, 9, 9), (-1.0,) * 3, (1.0, 1.0, 1.0))
     sigma = medium.sigma_t.clone().requires_grad_()
     o = torch.tensor([[-3.0, 0.0, 0.0]], dtype=torch.float64)
     d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    out = receive(medium._replace(sigma_t=sigma), (o, d), (Beam((0.0, 0.0, 1.0), (1.0,) * 3),), ISOTROPIC, step=0.1)
+    out = receive(medium._replace(sigma_t=sigma), (o, d), (Beam((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)),), ISOTROPIC, step=0.1)
     out.radiance.sum().backward()
+    assert sigma.grad is not None
     above, below = sigma.grad[4, 4, 6], sigma.grad[4, 4, 2]
     assert float(above) < -1e-4 and float(below) == 0
 

@@ -14,7 +14,7 @@ from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.measure import truth
 from nerfvol.measure.metrics import psnr
 from nerfvol.measure.scores import evaluate
-from nerfvol.medium.lighting import Beam, Lighting, Lobe, load_lighting
+from nerfvol.medium.lighting import Lighting, load_lighting, parse_lighting
 from nerfvol.medium.model import MediumModel
 from nerfvol.models import load_model
 from nerfvol.training.convert import cameras_around
@@ -29,8 +29,9 @@ def true_model() -> MediumModel:
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, 12)] * 3, indexing="ij")
     sigma = (6 * np.clip(0.85 - np.sqrt(x * x + y * y + z * z), 0, 0.5)).astype(np.float32)
     albedo = np.stack([0.8 + 0 * x, 0.55 + 0.3 * np.sign(x), 0.5 + 0.3 * z], -1).astype(np.float32)
-    beams = {name: (Beam(tuple(np.array(v) / np.linalg.norm(v)), (12.0,) * 3),) for name, v in SUNS.items()}
-    return MediumModel(sigma, albedo, np.array([[-1.0] * 3, [1.0] * 3]), Lighting(beams, (Lobe(0.3, 1.0),), 1.5))
+    suns = {name: [{"towards": list(v), "irradiance": [12.0] * 3}] for name, v in SUNS.items()}
+    lighting = parse_lighting({"lights": suns, "phase": [{"g": 0.3, "weight": 1.0}], "exposure": 1.5}, "suns")
+    return MediumModel(sigma, albedo, np.array([[-1.0] * 3, [1.0] * 3]), lighting)
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +166,6 @@ def test_commands(scene, tmp_path, capsys):
 def test_refusals(scene, tmp_path, capsys, more, said):
     other = tmp_path / "other.json"
     other.write_text(json.dumps({"lights": {"noon": [{"towards": [0, 0, 1], "irradiance": [1, 1, 1]}]}}))
-    given = [{"LIGHTS": str(scene / "lights.json"), "OTHER": str(other)}.get(word, word) for word in more]
+    given = [{"LIGHTS": str(scene / "lights.json"), "OTHER": str(other)}.get(word) or word for word in more]
     assert main(["train", "--data", str(scene), "--out", str(tmp_path / "run"), *given]) == 2
     assert said in capsys.readouterr().err
