@@ -40,6 +40,7 @@ PEOPLE, MASKS, FAULTS = "datasets/test_whatever_people_bring.py", "datasets/test
 PROGRAMS, PLAIN = "datasets/test_other_programs.py", "data_synth/test_plain.py"
 ROUGH = "data_synth/test_rough.py"
 TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.py"
+SETS, EXPOSURES, POSE_MASKS = "datasets/test_dataset.py", "starts/test_exposures.py", "poses/test_masks.py"
 MUTANTS = (
     # ---------------------------------------------------------------- cameras
     M("nerfvol/cameras/camera.py", "np.arange(width) + 0.5\n        band", "np.arange(width)\n        band", "cameras", "rays through pixels' corners"),
@@ -218,6 +219,34 @@ MUTANTS = (
     # ---------------------------------------------------------------- kernels
     M("nerfvol/kernels/csrc/adjoint.h", "g[k] = 2 * weight * residual;", "g[k] = 2 * residual;", "kernels/test_train.py", "gradients without the rays' weights"),
     M("nerfvol/kernels/csrc/train.h", "w = std::max(w, leaf.max_weight);", "w = leaf.max_weight;", "kernels/test_train.py", "the last weight of a leaf is its largest"),
+    # ---------------------------------------------------------------- photographs
+    M("nerfvol/datasets/load.py", "_small(view.path, state.st_mtime_ns, state.st_size)", "_small(view.path, 0, 0)", SETS, "changed pictures are judged as they were"),
+    M("nerfvol/datasets/load.py", "_small(view.path, state.st_mtime_ns, state.st_size)", "_small(view.path, state.st_mtime_ns, 0)", SETS, "pictures of another size are judged as they were"),
+    M("nerfvol/datasets/load.py", "lru_cache(maxsize=MOST_JUDGED)", "lru_cache(maxsize=0)", SETS, "each split decodes what it is judged by"),
+    M("nerfvol/datasets/photographs.py", "fits = self._most is None or self._bytes + more <= self._most", "fits = True", "datasets/test_photographs.py", "photographs are kept without bound"),
+    M("nerfvol/datasets/photographs.py", "self._bytes -= view.image.nbytes", "pass", "datasets/test_photographs.py", "what is dropped counts on"),
+    M("nerfvol/training/memory.py", "return dataset.nbytes + kept, kept / wanted", "return kept, kept / wanted", "training/test_memory.py", "the images themselves are not in the estimate"),
+    M("nerfvol/poses/sources.py", "    if not heif:\n        return []\n    return [f", "    if True:\n        return []\n    return [f", "poses/test_sources.py", "HEIC pictures beside others are passed over in silence"),
+    M("nerfvol/poses/video.py", "select = _any_of(chosen)", "select = '+'.join(map(_any_of, zip(chosen)))", "poses/test_video.py", "more than 100 frames of a video are refused"),
+    M("nerfvol/poses/masks.py", "small) < 255] = 0", "small) < 1] = 0", POSE_MASKS, "smaller pixels that show a part of what is masked are seen"),
+    M("nerfvol/poses/masks.py", "pixels if mask.black_is_out else 255 - pixels", "pixels", POSE_MASKS, "the convention of dynamic masks, copied"),
+    M("nerfvol/poses/masks.py", "1 if painted_upright else orientation", "orientation", POSE_MASKS, "masks that were painted upright are refused"),
+    M("nerfvol/poses/engine.py", "reader.mask_path = job.masks", "pass", POSE_MASKS, "features of what is masked"),
+    M("nerfvol/poses/engine.py", "if _has_mask(job, name) == masked]", "if masked or not job.masks]", POSE_MASKS, "photographs without a mask get no features"),
+    M("nerfvol/poses/make.py", "files += [mask.path for", "[] and [mask.path for", POSE_MASKS, "other masks, the same cameras"),
+    M("nerfvol/starts/exposures.py", "right[i] -= ratio", "right[i] -= 0", EXPOSURES, "half of the normal equations"),
+    M("nerfvol/starts/exposures.py", "gains /= gains[seen].mean(0)", "gains *= 1.1", EXPOSURES, "the mean exposure is not 1"),
+    M("nerfvol/starts/exposures.py", "float(np.sqrt((apart * apart).mean() / 2))", "float(logs.std())", EXPOSURES, "slow changes are a reason for maps"),
+    M("nerfvol/starts/exposures.py", "1.4826 * float(np.median(np.abs(left.mean(1))))", "float(left.std())", EXPOSURES, "one pair in a shadow makes all doubtful"),
+    M("nerfvol/starts/exposures.py", "< COVERED * n", "< 0", EXPOSURES, "what shares nothing is compared"),
+    M("nerfvol/training/train.py", "left >= MEASURED_FROM * len(dataset)", "left >= 0", "training/test_appearance.py", "seconds that a run does not have measure exposures"),
+    M("nerfvol/training/train.py", "run.phase != config.representation:", "True:", "training/test_appearance.py", "resumed runs measure exposures again"),
+    M("nerfvol/cameras/motions.py", "w - np.cross(pivot, v)", "w + np.cross(pivot, v)", "cameras/test_motions.py", "the gradient of a turn about the pivot"),
+    M("nerfvol/cameras/motions.py", "+ pivot - rotation_of(step[:3]) @ pivot", "", "cameras/test_motions.py", "steps about the camera's centre"),
+    M("nerfvol/cameras/motions.py", "scale * self.poses[:, :3, 3] @ rotation.T + shift", "self.poses[:, :3, 3] @ rotation.T + shift", "cameras/test_motions.py", "cameras come back without the scale"),
+    M("nerfvol/training/splat_trainer.py", "view_of(self._placed(index, view.camera), self.state.origin, near)", "view_of(view.camera, self.state.origin, near)", "training/test_refinement.py", "steps see the given poses"),
+    M("nerfvol/training/splat_trainer.py", "self.motions.load_state_dict(state[\"motions\"])", "pass", "training/test_refinement.py", "resumed runs begin with the given poses"),
+    M("nerfvol/training/splat_trainer.py", "splats = similar(splats, scale, rotation, shift)", "pass", "training/test_refinement.py", "the scene does not come back with its cameras"),
     # ---------------------------------------------------------------- data_synth
     M("data_synth/phase.py", "q = 1.0 + g * g - 2.0 * g * cosine", "q = 1.0 + g * g - g * cosine", "data_synth/test_phase.py", "Henyey-Greenstein's denominator"),
     M("data_synth/rough.py", "q = h[2] * h[2] * (a2 - 1.0) + 1.0", "q = h[2] * (a2 - 1.0) + 1.0", ROUGH, "GGX's denominator"),

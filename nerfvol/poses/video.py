@@ -9,7 +9,7 @@ import contextlib
 import os
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,7 +80,7 @@ def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list
     folder.mkdir(parents=True, exist_ok=True)
     names = [f"frame_{number:05d}.jpg" for number in chosen]
     with tempfile.TemporaryDirectory(dir=folder, prefix=".frames") as temporary:
-        select = "+".join(f"eq(n\\,{number})" for number in chosen)
+        select = _any_of(chosen)
         fit = f"scale='min({size},iw)':'min({size},ih)':force_original_aspect_ratio=decrease:flags=lanczos"
         out = ["-fps_mode", "passthrough", "-q:v", "2", "-f", "image2", str(Path(temporary) / "%05d.jpg")]
         result = subprocess.run(
@@ -92,6 +92,14 @@ def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list
         for file, name in zip(made, names, strict=True):
             os.replace(file, folder / name)
     return names
+
+
+def _any_of(numbers: Sequence[int]) -> str:
+    """ffmpeg's expression for "the frame is one of ``numbers``": in halves, since it refuses more than 100 terms in a row."""
+    if len(numbers) == 1:
+        return f"eq(n\\,{numbers[0]})"
+    half = len(numbers) // 2
+    return f"({_any_of(numbers[:half])}+{_any_of(numbers[half:])})"
 
 
 def _ffmpeg(path: Path) -> list[str]:

@@ -42,6 +42,7 @@ from nerfvol.octree.tree import Octree
 from nerfvol.starts.exposures import measure_exposures
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.compiled_field import CompiledFieldTrainer
+from nerfvol.training.few_views import few_views
 from nerfvol.training.field_start import make_field_trainer, make_final_trainer
 from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, photographs_bytes, splat_memory
 from nerfvol.training.octree_trainer import OctreeTrainer
@@ -230,6 +231,9 @@ def announce(run: Run, memory: str) -> None:
     run.say(f"training {run.config.representation}{why}")
     run.say(f"{len(run.data.training)} training views of {lens.width}x{lens.height}, {len(run.data.held_out)} held out; "
             f"memory: {memory}")  # fmt: skip
+    said = few_views(len(run.data.training), run.data.training.scene.is_unbounded)
+    if said is not None:
+        run.say(said)
 
 
 # ------------------------------------------------------------------ the loop

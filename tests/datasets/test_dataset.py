@@ -1,15 +1,18 @@
 """What can be asked of posed images: a few of them, smaller ones, what stands right before a lens."""
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
 
+from nerfvol.datasets import load
 from nerfvol.datasets.dataset import NEAR_SHARE, Dataset
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
 from tests.fixtures.scenes import random_images, ring
+from tests.fixtures.tiny import write_scene
 
 
 def test_a_few_views_come_from_all_around(tiny_scene):
@@ -72,3 +75,23 @@ def test_what_stands_before_a_lens(tiny_scene):
     with_shells = SceneBounds(dataset.scene.aabb, 8 * dataset.scene.aabb, has_alpha=False)
     hidden = dataclasses.replace(dataset, scene=with_shells).before_a_lens(points)
     assert hidden.tolist() == [True] * 24 + [False] * 12
+
+
+def test_pictures_that_the_kind_of_scene_is_judged_by_are_decoded_once_for_all_splits(tmp_path, monkeypatch):
+    """And again where a file has changed: by its time, or by its size."""
+    write_scene(tmp_path, {"train": 5, "val": 2}, size=20)
+    read, asked = load.read_small, []
+    monkeypatch.setattr(load, "read_small", lambda path, size: asked.append(path.name) or read(path, size))
+    load._small.cache_clear()
+    for split in ("train", "val", "train"):
+        kind = load_dataset(tmp_path, split).kind
+    assert sorted(asked) == [f"r_{i}.png" for i in range(5)] and kind == "object"
+    picture = tmp_path / "train" / "r_3.png"
+    state = picture.stat()
+    os.utime(picture, ns=(state.st_atime_ns, state.st_mtime_ns + 1000))
+    load_dataset(tmp_path, "val")
+    assert asked[5:] == ["r_3.png"]
+    picture.write_bytes(picture.read_bytes() + b" ")
+    os.utime(picture, ns=(state.st_atime_ns, state.st_mtime_ns + 1000))
+    load_dataset(tmp_path, "val")
+    assert asked[6:] == ["r_3.png"]

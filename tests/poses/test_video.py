@@ -59,6 +59,20 @@ def test_a_video_gives_its_sharp_frames(video, tmp_path):
         assert image.size == (80, 60)
 
 
+def test_more_than_a_hundred_frames_can_be_taken(tmp_path):
+    """As `nerfvol capture` takes of a minute; frame k of this video is a grey of 20 + k."""
+    path = tmp_path / "long.mp4"
+    with open_video(path, 30) as writer:
+        for k in range(125):
+            writer.add(np.full((32, 32, 3), (20 + k) / 255, np.float32))
+    chosen = [k for k in range(125) if k % 11]
+    names = write_frames(path, chosen, tmp_path / "images", 32)
+    assert len(names) == len(chosen) > 110
+    for k in (1, 57, 124):
+        with Image.open(tmp_path / "images" / f"frame_{k:05d}.jpg") as image:
+            assert abs(float(np.asarray(image.convert("L")).mean()) - 20 - k) < 3
+
+
 def test_what_does_not_decode_is_said(tmp_path):
     path = tmp_path / "broken.mp4"
     path.write_bytes(b"not a video at all" * 100)
