@@ -99,16 +99,19 @@ def test_one_picture_or_a_sentence(tmp_path, files, command):
     assert {p.name for p in tmp_path.iterdir()} == {"x.png"}
 
 
-def test_cameras_of_two_sizes(tmp_path, files, command):
+@pytest.mark.parametrize(
+    "ending, others", [(".mp4", [(24, 32)]), (".gif", [(16, 16), (48, 20)]), (".webm", [(32, 23)])]
+)
+def test_cameras_of_several_sizes(tmp_path, files, command, ending, others):
     lens = Intrinsics(32, 24, 40.0, 40.0, 16.0, 12.0)
     cameras = orbit(2, center=(0, 0, 0), radius=3.0, elevation_deg=20.0, intrinsics=lens)
-    cameras.append(Camera(Intrinsics(24, 32, 40.0, 40.0, 12.0, 16.0), cameras[0].c2w))
-    (tmp_path / "p.json").write_text(json.dumps(cameras_document(cameras, ["a", "b", "c"])))
-    code, said, err = command(
-        "render", files / "a.safetensors", "--cameras", tmp_path / "p.json", "--out", tmp_path / "v.mp4"
-    )
+    cameras += [Camera(Intrinsics(w, h, 40.0, 40.0, w / 2, h / 2), cameras[0].c2w) for w, h in others]
+    names = [str(k) for k in range(len(cameras))]
+    (tmp_path / "p.json").write_text(json.dumps(cameras_document(cameras, names)))
+    out = tmp_path / f"v{ending}"
+    code, said, err = command("render", files / "a.safetensors", "--cameras", tmp_path / "p.json", "--out", out)
     assert code == 0 and "all are drawn at the first one's, 32x24" in said, err
-    assert len(frames_of(tmp_path / "v.mp4", 32, 24)[0]) == 3
+    assert len(frames_of(out, 32, 24)[0]) == len(cameras)
 
 
 def test_frames_between_keyframes(tmp_path, files, command):

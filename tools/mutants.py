@@ -328,6 +328,9 @@ def _build(copy: Path) -> Path:
     """The kernels of the copy, built in it; a second time only what has changed."""
     build = copy / "build" / "mutant"
     generator = ["-G", "Ninja"] if shutil.which("ninja") else []
+    if shutil.which("ccache"):  # what a bug does not touch is not compiled again
+        generator.append("-DCMAKE_CXX_COMPILER_LAUNCHER=ccache")
+        os.environ["CCACHE_BASEDIR"] = str(copy)
     options = ["-DSKBUILD_PROJECT_VERSION=mutant", f"-DPython_EXECUTABLE={sys.executable}"]
     quiet = {"check": True, "stdout": subprocess.DEVNULL}
     subprocess.run(["cmake", "-S", copy / "nerfvol/kernels/csrc", "-B", build, *generator, *options], **quiet)  # pyright: ignore[reportCallIssue, reportArgumentType]

@@ -22,7 +22,7 @@ ENOUGH_TILES, ENOUGH_TILES_OF_PHOTOGRAPHS = 20_000, 80_000
 """... and so many at most: around photographs much is seen at the rim of a few of them only, which takes more tiles to meet."""
 FINE_LEVEL = 9
 """From this level on a stage splits leaves once, and ..."""
-FINE_STEPS, FINER_STEPS = 1000, 2500
+FINE_STEPS, FINER_STEPS = 800, 2500
 """... is left out where fewer steps would be left for it: the first number at that level, the second at those beyond."""
 PRUNE_SHARE, FEWEST_PRUNE_STEPS = 0.05, 10
 """Of the steps that a run will make, what comes before a pruning at most, and the fewest: a run that has no time for

@@ -64,6 +64,20 @@ def test_even_keyframes_are_catmull_rom_and_shoemake():
     assert np.allclose(middle, (-places[0] + 9 * places[1] + 9 * places[2] - places[3]) / 16)  # Catmull-Rom at 1/2
 
 
+@pytest.mark.parametrize("axis", np.eye(3).tolist())
+def test_a_camera_that_spins_never_turns_back(axis):
+    """By 100 degrees a keyframe, twice around: q and -q are one rotation, and the way between is the shorter one."""
+    angles = np.radians(100.0) * np.arange(8)
+    turns = rotations([[np.cos(a / 2), *(np.sin(a / 2) * np.array(axis))] for a in angles])
+    keys = [
+        Camera(LENS, np.block([[turn, np.array([[k], [0.0], [0.0]])], [np.eye(4)[3:]]])) for k, turn in enumerate(turns)
+    ]
+    found = poses(interpolated(keys, 7 * 20 + 1))[:, :3, :3]
+    steps = np.radians(5.0) * np.arange(len(found))
+    wanted = rotations([[np.cos(a / 2), *(np.sin(a / 2) * np.array(axis))] for a in steps])
+    assert np.allclose(found, wanted, atol=1e-9)
+
+
 def test_uneven_keyframes_by_barry_and_goldman():
     """Halfway between the middle two of four, through their pyramid of linear interpolations at centripetal knots (1988)."""
     places = np.array([[0, 0, 0], [0.2, 0.1, 0], [2, 1, 1], [2.5, -1, 3.0]])

@@ -300,6 +300,28 @@ def test_numpy_and_raw(tmp_path):
         read_volume(tmp_path / "bad.npz")
 
 
+@pytest.mark.parametrize("kind", ["S4", "U1", "complex64", "M8[s]", "object", "V4", "float99", ""])
+def test_raw_samples_of_a_type_that_is_no_number(tmp_path, kind):
+    path = tmp_path / f"head_2x2x2_{kind}.raw"
+    path.write_bytes(bytes(range(64)))
+    with pytest.raises(InputError, match="head_2x2x2") as caught:
+        read_volume(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("steering", ["\x1b[2J", "\x1b]0;x\x07", "\u202e", "a\0b"])
+def test_a_grids_name_does_not_steer_the_terminal(tmp_path, values, steering, command):
+    """It is said as text."""
+    file, out = tmp_path / "a.vdb", tmp_path / "s"
+    write_grids(file, [SparseGrid(steering + "x" * 3, np.argwhere(values > 0)[:9], np.ones(9, np.float32))])
+    whole = bytearray(file.read_bytes())
+    at = whole.index(b"Tree_float_5_4_3") + 16 + 4 + 16
+    whole[at : at + 8] = struct.pack("<q", at - 60)
+    file.write_bytes(whole)
+    code, _, said = command("synth", "smoke", "--volume", file, "--views", "1", "--size", "8x8", "--out", out)
+    assert code == 2 and "says it lies at bytes" in said and said.strip().isprintable()
+
+
 def test_pickles_are_not_loaded(tmp_path):
     np.save(tmp_path / "evil.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(InputError, match="evil.npy"):

@@ -302,6 +302,19 @@ def test_test_cameras_without_pictures_are_left_out(tmp_path):
     said(train, f"transforms_test.json lists {len(plain['frames'])} cameras without pictures")
 
 
+@pytest.mark.parametrize("gone, lists, held", [
+    (("val",), "transforms_val.json lists 9", 9), (("val", "test"), "transforms_test.json lists 9", 2),
+])  # fmt: skip
+def test_where_one_of_two_splits_has_no_pictures_the_other_is_scored(tmp_path, gone, lists, held):
+    """With pictures in neither, every 8th training view is."""
+    scenes.write_blender(tmp_path, scenes.ring(), scenes.random_images(), splits=("train", "val", "test"))
+    for split in gone:
+        for path in (tmp_path / split).iterdir():
+            path.unlink()
+    dataset = load_dataset(tmp_path, "val")
+    assert len(dataset) == held and any(f"{lists} cameras without pictures" in m for m in dataset.messages)
+
+
 def test_whatever_a_file_says_and_nobody_uses_gets_one_sentence(tmp_path):
     def extra(document):
         document.update(applied_scale=2.0, wibble={"a": 1}, nothing=None)

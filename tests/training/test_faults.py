@@ -1,13 +1,16 @@
 """Faults around a run: other pictures, a second writer, a full disk, scenes far from the origin, signals."""
 
 import dataclasses
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from nerfvol.config.training import Config, OctreeConfig
 from nerfvol.datasets.fingerprint import changes, fingerprint
@@ -54,6 +57,51 @@ def test_a_fingerprint_knows_what_changed(dataset):
         names=[dataset.names[i] for i in order],
     )  # fmt: skip
     assert "another order" in changes(before, fingerprint(turned))
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory, tiny_scene):
+    """A run that was stopped after five steps."""
+    from tests.fixtures.runs import settings, start
+
+    def stop(run, phase, began):
+        run.interrupted = run.interrupted or phase.steps_done >= 5
+
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    with pytest.raises(KeyboardInterrupt):
+        start(settings(tiny_scene, folder), say=lambda sentence: None, watch=stop)
+    return folder
+
+
+def edit(folder, change):
+    """Changes the document of the training views."""
+    path = folder / "transforms_train.json"
+    document = json.loads(path.read_text())
+    change(document["frames"])
+    path.write_text(json.dumps(document))
+
+
+def turn_over(path):
+    Image.open(path).transpose(Image.Transpose.ROTATE_180).save(path)
+
+
+@pytest.mark.parametrize("change, said", [
+    (lambda d: [path.unlink() for path in sorted((d / "train").iterdir())[2:]], "10 are gone"),
+    (lambda d: edit(d, lambda frames: frames.__delitem__(slice(2, None))), "10 are gone"),
+    (lambda d: edit(d, lambda frames: frames.reverse()), "order"),
+    (lambda d: edit(d, lambda frames: frames[3]["transform_matrix"][0].__setitem__(3, 3.3)), "another pose"),
+    (lambda d: turn_over(sorted((d / "train").iterdir())[4]), "other pixels"),
+])  # fmt: skip
+def test_a_run_is_resumed_with_its_own_pictures_alone(stopped, tmp_path, tiny_scene, command, change, said):
+    """One sentence, whatever became of them, and nothing of the run is touched."""
+    scene, run = tmp_path / "scene", tmp_path / "run"
+    shutil.copytree(tiny_scene, scene)
+    shutil.copytree(stopped, run)
+    change(scene)
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    code, _, err = command("train", "--resume", "--out", run, "--data", scene)
+    assert code == 2 and "the pictures are not those that the run was begun with" in err and said in err
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
 def test_a_folder_has_one_writer(tmp_path):

@@ -79,10 +79,10 @@ def test_what_tells_what_no_ray_needs():
 
 
 def test_a_fine_stage_needs_steps():
-    """1,000 of them at level 9, 2,500 beyond; a coarse one as many as its prunings wait."""
+    """800 of them at level 9, 2,500 beyond; a coarse one as many as its prunings wait."""
     config = OctreeConfig()
     assert config.levels[4:] == [8, 9, 10]
-    assert not is_worth_it(config, 5, 1500, 0.35) and is_worth_it(config, 5, 1600, 0.35)
+    assert not is_worth_it(config, 5, 1230, 0.35) and is_worth_it(config, 5, 1240, 0.35)
     assert not is_worth_it(config, 6, 6200, 0.6) and is_worth_it(config, 6, 6300, 0.6)
     assert is_worth_it(config, 4, 400, 0.8) and not is_worth_it(config, 4, 400, 0.95)
 

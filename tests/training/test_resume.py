@@ -183,10 +183,19 @@ def test_clock_and_running_error_go_on_where_the_checkpoint_left_them(whole, tmp
     lambda t: t.update(values=t["values"][:-1], moments=t["moments"][:-1]), lambda t: t.update(moments=t["moments"][:, :4]),
     lambda t: t.update(error=t["error"][:-1]), lambda t: t.update(footprint=t["footprint"][None]),
     lambda t: t.update(node_mask=t["node_mask"][:-1]), lambda t: t.update(stage="first"), lambda t: t.pop("cursors"),
+    lambda t: t["cursors"]["foreground"].update(position=-1), lambda t: t["cursors"]["background"].update(epoch="x"),
 ])  # fmt: skip
 def test_a_checkpoint_whose_parts_do_not_fit_is_refused(whole, tmp_path, tiny_scene, change):
     with pytest.raises(InputError):
         resumed(whole, tmp_path / "run", tiny_scene, 45, lambda state: change(state["trainer"]))
+
+
+@pytest.mark.parametrize("position", [10**6, 2**62])
+def test_a_place_behind_the_end_of_the_queue_ends(whole, tmp_path, tiny_scene, position):
+    """With other tiles than the checkpoint's a queue once waited for ever to come to its end; it begins a new epoch."""
+    change = lambda state: state["trainer"]["cursors"]["foreground"].update(position=position)  # noqa: E731
+    run = resumed(whole, tmp_path / "run", tiny_scene, 45, change)
+    assert metrics_of(run)["steps"]["octree"] == 60
 
 
 def test_a_run_outside_the_main_thread_leaves_signals_alone(tmp_path, tiny_scene):
