@@ -158,11 +158,14 @@ def print_tables(record: dict[str, Any]) -> None:
     octree = record["octree"]
     _print_head(record, f"{octree['path']}: {octree['leaves']:,} leaves")
     _print_rates(record, "frames a second", "frames_per_second")
-    print(f"\nfinest grid      leaves   frames/s at {record['view_size']}²   training rays/s   segments/ray")
+    print(
+        f"\nfinest grid      leaves   frames/s at {record['view_size']}²   training rays/s   segments/ray   million segments/s"
+    )
     for row in record["size"]:
         print(
             f"{2 ** row['level']:8d}³ {row['leaves']:12,d} {row['frames_per_second']:16.2f} "
-            f"{row['train_rays_per_second']:18,.0f} {row['samples_per_ray']:14.1f}"
+            f"{row['train_rays_per_second']:18,.0f} {row['samples_per_ray']:14.1f} "
+            f"{row['train_segments_per_second'] / 1e6:20.1f}"
         )
     _print_roofline(record)
     if "reference" in record:

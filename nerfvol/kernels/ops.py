@@ -193,6 +193,7 @@ def leaf_statistics(
     return _step_report(report, len(d))
 
 
-def _step_report(report: tuple[float, float, float], n_rays: int) -> StepReport:
-    squared, weight, samples = report
-    return StepReport(squared / max(3 * weight, 1e-30), samples / max(n_rays, 1))
+def _step_report(report: tuple[float, float, float, float], n_rays: int) -> StepReport:
+    squared, weight, samples, tested = report
+    packets = max(-(-n_rays // TILE_RAYS), 1)
+    return StepReport(squared / max(3 * weight, 1e-30), samples / max(n_rays, 1), tested=tested / packets)

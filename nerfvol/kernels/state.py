@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -97,10 +97,12 @@ class Rates:
 
 @dataclass(frozen=True)
 class StepReport:
-    """squared_error: weighted mean over rays and channels; samples: segments per ray."""
+    """squared_error: weighted mean over rays and channels; samples: segments per ray; tested: leaves per 64 rays whose boxes
+    the kernels tested against rays, which a walk that culls well keeps near those met (0: the reference has no packets)."""
 
     squared_error: float
     samples: float
+    tested: float = field(default=0.0, kw_only=True)
 
 
 class LeafStatistics:

@@ -87,7 +87,7 @@ def measure_sizes(
     rows = []
     for level in range(max(5, octree.max_level - 4), octree.max_level + 1):
         tree = octree if level == octree.max_level else lod.at_level(octree, level)
-        rate, samples = training_rate(tree, cameras, repeats)
+        rate, samples, tested = training_rate(tree, cameras, repeats)
         rows.append(
             {
                 "level": level,
@@ -95,6 +95,8 @@ def measure_sizes(
                 "frames_per_second": 1.0 / _frame_seconds(tree, cameras, repeats),
                 "train_rays_per_second": rate,
                 "samples_per_ray": samples,
+                "train_segments_per_second": rate * samples,
+                "leaves_tested_per_tile": tested,
                 **roofline.roofs(tree, cameras[0], _batch(tree, cameras[0], 0, TRAIN_TILES), machine),
             }
         )
@@ -108,17 +110,19 @@ def exponents(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     return {name: roofline.fitted_exponent(leaves, [1.0 / row[key] for row in rows]) for name, key in keys.items()}
 
 
-def training_rate(octree: Octree, cameras: Sequence[Camera], repeats: int) -> tuple[float, float]:
-    """Rays a second of forward, backward and optimiser on 8x8 tiles, and segments a ray; ``octree`` stays as it is."""
+def training_rate(octree: Octree, cameras: Sequence[Camera], repeats: int) -> tuple[float, float, float]:
+    """Rays a second of forward, backward and optimiser on 8x8 tiles, segments a ray, and leaves that the walk had to test for a
+    tile; ``octree`` stays as it is."""
     batches = [_batch(octree, camera, seed, TRAIN_TILES) for seed, camera in enumerate(cameras)]
-    samples = []
+    reports = []
     train_step = _still(ops.train_step, octree, cameras[0])
 
     def step(index: int) -> None:
-        samples.append(train_step(batches[index % len(batches)]).samples)
+        reports.append(train_step(batches[index % len(batches)]))
 
     seconds = median_seconds(step, repeats)
-    return len(batches[0].rays_d) / seconds, statistics.median(samples)
+    samples, tested = (statistics.median(getattr(report, name) for report in reports) for name in ("samples", "tested"))
+    return len(batches[0].rays_d) / seconds, samples, tested
 
 
 def _still(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.errors import InputError
+from nerfvol.native import native
 from nerfvol.octree.rows import DENSITY_SCALE, DENSITY_SLOT, EMPTY_DENSITY, explin_inverse, sh_slots
 from nerfvol.octree.topology import demorton, morton
 from nerfvol.octree.tree import Octree
@@ -181,21 +182,41 @@ def _write(
     wide = g.scales[which] ** 2 + (BLUR * side[:, None]) ** 2
     thickness = -np.log1p(-np.minimum(g.opacity[which], 0.99))
     sigma = thickness / np.sqrt(2 * np.pi * wide.min(1)) * np.exp(-0.5 * (own**2 / wide).sum(1))
-    leaf = octree.query(centers)
     # A cell that was split: its density goes to the leaves in it that finer Gaussians fill as well.
-    n = octree.n_leaves
-    held = np.bincount(leaf[leaf >= 0], sigma[leaf >= 0], n)
-    rows = np.stack(
-        [np.bincount(leaf[leaf >= 0], sigma[leaf >= 0] * column[which[leaf >= 0]], n) for column in sh.T], 1
-    )
-    sides = octree.leaf_sizes()
-    share = rows / np.maximum(held, 1e-12)[:, None]
-    held = np.minimum(held, _THICKEST / sides)
-    corner, leaves = octree.corners.reshape(-1), np.repeat(np.arange(n), 8)
+    leaf = _leaves_at(octree, levels, codes, centers)
+    lies = np.flatnonzero(leaf >= 0)
+    colours = np.column_stack([np.ones(len(sh)), sh]).astype(np.float64)  # the first column adds up the densities
+    sums = _summed(colours, which[lies], sigma[lies], leaf[lies], octree.n_leaves)
+    share = np.column_stack([np.ones(len(sums)), sums[:, 1:] / np.maximum(sums[:, :1], 1e-12)])
+    held = np.minimum(sums[:, 0], _THICKEST / octree.leaf_sizes())
+    corner, leaves = octree.corners.reshape(-1).astype(np.int64), np.repeat(np.arange(octree.n_leaves), 8)
     count = np.bincount(corner, minlength=octree.n_vertices)
-    total = np.bincount(corner, held[leaves], octree.n_vertices)
-    values = np.stack([np.bincount(corner, (held * column)[leaves], octree.n_vertices) for column in share.T], 1)
-    octree.values[:, sh_slots(octree.sh_degree).reshape(-1)] = values / np.maximum(total, 1e-12)[:, None]
+    values = _summed(share, leaves, held[leaves], corner, octree.n_vertices)
+    total = values[:, 0]
+    octree.values[:, sh_slots(octree.sh_degree).reshape(-1)] = values[:, 1:] / np.maximum(total, 1e-12)[:, None]
     raw = explin_inverse(np.maximum(total / count / octree.density_scale, 1e-30))
     octree.values[:, DENSITY_SLOT] = np.maximum(raw, EMPTY_DENSITY)
     octree.prefiltered = None
+
+
+def _leaves_at(
+    octree: Octree, levels: NDArray[np.int64], codes: NDArray[np.int64], centers: Float
+) -> NDArray[np.int64]:
+    """(m,) the leaf that holds the centre of each cell, -1: none; each cell is looked up once, however often it is named."""
+    keys = (levels << 58) | codes
+    order = np.argsort(keys)
+    ordered = keys[order]
+    first = np.concatenate([[True], ordered[1:] != ordered[:-1]])
+    leaf = np.empty(len(keys), np.int64)
+    leaf[order] = octree.query(centers[order[first]])[np.cumsum(first) - 1]
+    return leaf
+
+
+def _summed(rows: Float, of: NDArray[np.int64], weight: Float, to: NDArray[np.int64], n: int) -> Float:
+    """(n, width) sums of ``weight`` (m,) times the rows (any, width) numbered ``of`` (m,), each into the row ``to`` (m,)."""
+    compiled = native()
+    if compiled is not None:
+        sums = np.zeros((n, rows.shape[1]))
+        compiled.add_rows(np.ascontiguousarray(rows), of, weight, to, sums)
+        return sums
+    return np.stack([np.bincount(to, weight * column[of], n) for column in rows.T], 1)

@@ -168,6 +168,10 @@ class CompiledFieldTrainer:
         """A field does not grow."""
         return None
 
+    def outcome(self) -> str | None:
+        """What a field could still learn is not known."""
+        return None
+
     def picture(self, camera: Camera) -> np.ndarray:
         """(height, width, 3) float32 image of the field as ``camera`` sees it."""
         return self.trained_field().picture(camera)

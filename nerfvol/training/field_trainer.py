@@ -211,6 +211,10 @@ class FieldTrainer:
         """A field does not grow."""
         return None
 
+    def outcome(self) -> str | None:
+        """What a field could still learn is not known."""
+        return None
+
     def picture(self, camera: Camera) -> np.ndarray:
         """(height, width, 3) float32 image of the field as ``camera`` sees it."""
         rays_o, rays_d = (torch.from_numpy(rays) for rays in camera.rays())

@@ -84,6 +84,10 @@ class Phase(Protocol):
         """A sentence where the representation needs more memory than was announced."""
         ...
 
+    def outcome(self) -> str | None:
+        """Once the steps are over, a sentence on what they went into and whether more would pay; None: there is none."""
+        ...
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs: arrays, numbers and strings."""
         ...

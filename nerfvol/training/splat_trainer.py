@@ -110,6 +110,10 @@ class SplatTrainer:
         """The number of splats is bounded before the start."""
         return None
 
+    def outcome(self) -> str | None:
+        """What splats could still learn is not known."""
+        return None
+
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs."""
         return {

@@ -264,6 +264,8 @@ def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
                 run.save_if_possible(phase)
             if run.watch is not None:
                 run.watch(run, phase, phase.stage != stage)
+    if (sentence := phase.outcome()) is not None:
+        run.say(sentence)
     if phase.stages_left:
         run.say(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
 

@@ -27,9 +27,9 @@ def test_median_does_not_count_the_first_call(monkeypatch):
 def test_training_rate_leaves_the_octree_as_it_is(cameras):
     octree = make_sphere_octree(4)
     before = octree.values.copy()
-    rate, samples = bench.training_rate(octree, cameras, 2)
+    rate, samples, tested = bench.training_rate(octree, cameras, 2)
     assert np.array_equal(octree.values, before)
-    assert rate > 0 and 0 < samples < 64
+    assert rate > 0 and 0 < samples < 64 and 0 < tested < octree.n_leaves
 
 
 def test_bench_command(tmp_path, command, monkeypatch):
@@ -46,7 +46,7 @@ def test_bench_command(tmp_path, command, monkeypatch):
     )  # fmt: skip
     assert code == 0 and "roofline: memory 20.0 GB/s read, 30.0 GB/s copied" in text
     assert (tmp_path / "b.svg").read_text().startswith("<?xml")
-    assert "frames a second" in text and "training rays/s" in text
+    assert "frames a second" in text and "training rays/s" in text and "million segments/s" in text
     record = json.loads((tmp_path / "b.json").read_text())
     assert {row["size"] for row in record["render"]} == {16, 32}
     assert all(row["frames_per_second"] > 0 for row in record["render"])
@@ -54,6 +54,7 @@ def test_bench_command(tmp_path, command, monkeypatch):
     assert record["reference"]["kernel_over_paper_mlp"] > 0 and record["reference"]["train_step_kernel_over_torch"] > 0
     assert record["machine"]["bandwidth"] == 3e10 and record["exponents"] == {"frame": None, "train_ray": None}
     size = record["size"][-1]
+    assert size["train_segments_per_second"] == size["train_rays_per_second"] * size["samples_per_ray"]
     assert size["frames_per_second_by_bandwidth"] * size["frame_bytes"] == pytest.approx(3e10)
     assert size["train_rays_per_second_by_arithmetic"] * size["train_ray_operations"] == pytest.approx(1e11)
     assert record["file"]["bytes"] == (tmp_path / "o.safetensors").stat().st_size

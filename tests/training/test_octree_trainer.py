@@ -7,10 +7,12 @@ import weakref
 import numpy as np
 import pytest
 
+from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.config.training import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.load import load_dataset
 from nerfvol.kernels import ops
+from nerfvol.measure.leaf_width import visible_widths
 from nerfvol.octree.rows import DENSITY_SLOT, explin_inverse
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
@@ -343,6 +345,36 @@ def test_few_views_do_not_judge_what_is_solid_in_a_given_octree(tiny_scene, sphe
     again = OctreeTrainer(dataset, (1, 1, 1), config, 0, None)
     again.load_state_dict(trainer.state_dict())
     assert again.keeps_solid == keeps and not OctreeTrainer(dataset, (1, 1, 1), config).keeps_solid
+
+
+def test_the_outcome_counts_the_steps_of_each_size_and_says_whether_more_would_pay(tiny_scene, sphere_octree):
+    """Of a ball, seen in pictures in which its leaves are about as wide as pixels, and in some four times as large."""
+    dataset = load_dataset(tiny_scene, "train")
+    stages = {"levels": [5, 5, 5], "stage_ends": [0.2, 0.4, 1.0], "prunes": [0, 0, 0], "prune_steps": 0}
+    config = OctreeConfig(downscales=[4, 1, 1], tiles=[1, 1, 1], rate_density=0.0, **stages)
+    trainer = OctreeTrainer(dataset, (1, 1, 1), config, 0, None)
+    for stage, steps in enumerate((3, 2, 4)):
+        trainer.stage, trainer.bank = stage, None
+        for _ in range(steps):
+            trainer.step(0.0)
+    again = OctreeTrainer(dataset, (1, 1, 1), config, 0, None)
+    again.load_state_dict(trainer.state_dict())
+    again.octree = sphere_octree
+    verdicts = set()
+    for factor in (1, 4):
+        lenses = [
+            {k: factor * getattr(c.intrinsics, k) for k in ("width", "height", "fx", "fy", "cx", "cy")}
+            for c in dataset.cameras
+        ]
+        cameras = [Camera(Intrinsics(**lens), c.c2w) for lens, c in zip(lenses, dataset.cameras, strict=True)]
+        again.dataset = dataclasses.replace(dataset, cameras=cameras)
+        middle = np.median(visible_widths(sphere_octree, again.dataset.cameras))
+        sentence = again.outcome()
+        assert sentence is not None and sentence.startswith("steps: 3 on images /4, 6 on whole images; ")
+        assert f" are {middle:.1f} pixels wide" in sentence
+        assert ("more time would pay" in sentence) == (middle > 2) != ("more time would sharpen little" in sentence)
+        verdicts.add(middle > 2)
+    assert verdicts == {True, False}
 
 
 def test_the_last_pruning_keeps_what_no_ray_has_met_yet(tiny_scene):

@@ -19,6 +19,7 @@ struct Workspace {
     std::vector<Visit> visits;
     std::vector<int32_t> first_hit;       // of each visit
     size_t size = 0, capacity = 0;
+    int64_t tested = 0;                   // leaves, see march
 
     Hit* append(size_t n) {
         if (size + n > capacity) {
@@ -103,7 +104,7 @@ void forward_packet(const Tree& tree, Packet<1>& p, const BasisRows<B>& basis, f
     work.size = 0;
     work.visits.clear();
     work.first_hit.clear();
-    march<B>(tree, p, [&](const Leaf& leaf, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
+    work.tested = march<B>(tree, p, [&](const Leaf& leaf, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
         const Segments& s = segments[0];
         const int m = __builtin_popcountll(hits[0]);
         const size_t base = work.size;

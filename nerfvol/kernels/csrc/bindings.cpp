@@ -159,7 +159,7 @@ struct StatisticsArrays {
     }
 };
 
-nb::tuple report_of(const StepReport& r) { return nb::make_tuple(r.squared_error, r.weight, r.samples); }
+nb::tuple report_of(const StepReport& r) { return nb::make_tuple(r.squared_error, r.weight, r.samples, r.tested); }
 
 // One step of the optimiser, which updates the octree's own values and the moments.
 nb::tuple py_train_step(const TreeArrays& t, const BatchArrays& batch, const LossOptions& options, const Rates& rates,

@@ -55,8 +55,8 @@ struct Extinction {
 
 // The segments of one packet, delivered leaf by leaf: sink(leaf, hits, segments, field), the hits as bits and the segments by
 // strip. Leaves wait in a queue while their memory arrives: the walk asks for a leaf's corners, kRows leaves later the corners
-// are read and their rows asked for, kAhead leaves later it is used.
-template <int B, int S, class Sink> void march(const Tree& tree, const Packet<S>& p, Sink&& sink) {
+// are read and their rows asked for, kAhead leaves later it is used. Returns how many leaves were tested against the rays.
+template <int B, int S, class Sink> int64_t march(const Tree& tree, const Packet<S>& p, Sink&& sink) {
     constexpr uint32_t kAhead = 16, kRows = 8;
     Walk walk(tree, p.pyramid);
     Leaf queue[kAhead];
@@ -67,17 +67,19 @@ template <int B, int S, class Sink> void march(const Tree& tree, const Packet<S>
             for (int k = 0; k < B; ++k) __builtin_prefetch(c.values + 16 * (B * int64_t(c.corners[o]) + k));
     };
     Segments segments[S];
+    int64_t tested = 0;
     for (;;) {
         while (found - used < kAhead && walk.next(queue[found % kAhead])) {
             ++found;
             if (found - asked > kRows) ask();
         }
-        if (found == used) return;
+        if (found == used) return tested;
         if (found - used < kAhead)
             while (asked != found) ask();
         Leaf& leaf = queue[used++ % kAhead];
         leaf.patches &= p.pyramid.alive;
         if (!leaf.patches) continue;
+        ++tested;
         uint64_t hits[S], some = 0;
         for (int s = 0; s < S; ++s) {
             const uint64_t lanes = Packet<S>::lanes_of(leaf.patches, s) & p.strips[s].alive;

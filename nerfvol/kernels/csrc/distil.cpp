@@ -118,4 +118,13 @@ void merge_errors(const VertexRows& rows, const int32_t* corners, const int64_t*
     });
 }
 
+void add_rows(const double* rows, int64_t width, const int64_t* from, const double* weight, const int64_t* to, int64_t m,
+              double* sums) {
+    for (int64_t i = 0; i < m; ++i) {
+        const double w = weight[i], *row = rows + width * from[i];
+        double* sum = sums + width * to[i];
+        for (int64_t k = 0; k < width; ++k) sum[k] += w * row[k];
+    }
+}
+
 }  // namespace nerfvol

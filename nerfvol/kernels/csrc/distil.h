@@ -1,4 +1,5 @@
-// What distilling a field into an octree does over and over (nerfvol/starts/cells.py, nerfvol/octree/merge.py).
+// What making an octree of a field or of splats does over and over (nerfvol/starts/cells.py, nerfvol/starts/leaves.py,
+// nerfvol/octree/merge.py).
 #pragma once
 #include <cstdint>
 
@@ -24,5 +25,9 @@ struct VertexRows {
 // octant order; scale (m): density scale times a sibling's side.
 void merge_errors(const VertexRows& rows, const int32_t* corners, const int64_t* first, const float* scale, int64_t m,
                   float* error);
+
+// Adds weight[i] times row from[i] of rows (any, width) to row to[i] of sums (any, width), for i = 0 .. m - 1 in this order.
+void add_rows(const double* rows, int64_t width, const int64_t* from, const double* weight, const int64_t* to, int64_t m,
+              double* sums);
 
 }  // namespace nerfvol

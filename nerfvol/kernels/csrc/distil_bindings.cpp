@@ -41,10 +41,23 @@ void py_merge_errors(In<float, nb::ndim<2>> values, int density, In<int32_t, nb:
     merge_errors(rows, corners.data(), first.data(), scale.data(), m, error.data());
 }
 
+void py_add_rows(In<double, nb::ndim<2>> rows, In<int64_t, nb::ndim<1>> from, In<double, nb::ndim<1>> weight,
+                 In<int64_t, nb::ndim<1>> to, Out<double, nb::ndim<2>> sums) {
+    const int64_t m = int64_t(from.shape(0)), width = int64_t(rows.shape(1));
+    require(int64_t(weight.shape(0)) == m && int64_t(to.shape(0)) == m && int64_t(sums.shape(1)) == width,
+            "the arrays do not fit one another");
+    for (int64_t i = 0; i < m; ++i)
+        require(from.data()[i] >= 0 && from.data()[i] < int64_t(rows.shape(0)) && to.data()[i] >= 0 &&
+                    to.data()[i] < int64_t(sums.shape(0)), "a row lies outside the array");
+    nb::gil_scoped_release release;
+    add_rows(rows.data(), width, from.data(), weight.data(), to.data(), m, sums.data());
+}
+
 }  // namespace
 
 void bind_distilling(nb::module_& m) {
     m.def("dilate_cells", &py_dilate_cells, "cells"_a, "holds"_a, "kept"_a);
     m.def("merge_errors", &py_merge_errors, nb::kw_only(), "values"_a, "density"_a, "slots"_a, "bounds"_a, "corners"_a, "first"_a,
           "scale"_a, "error"_a);
+    m.def("add_rows", &py_add_rows, "rows"_a, "from"_a, "weight"_a, "to"_a, "sums"_a);
 }

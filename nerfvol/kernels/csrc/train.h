@@ -199,7 +199,7 @@ template <int B> void backward_run(const Batch& batch, Run run, int shift, Arena
     PacketState<1> state;
     forward_run<B>(batch, run, basis, state, mine.work);
     Adjoint adjoint;
-    rec.report = {0, 0, double(mine.work.size)};
+    rec.report = {0, 0, double(mine.work.size), double(mine.work.tested)};
     if (batch.loss) adjoint_of_loss(*batch.loss, state, run.first, run.n, adjoint, rec.report);
     else adjoint_of_cotangents(batch.tree, *batch.cotangents, batch.options, state, run.first, run.n, adjoint);
     backward_packet<B>(batch.tree, basis, mine.work, adjoint, mine.table, mine.gradients);
@@ -215,7 +215,7 @@ template <int B> void observe_run(const Batch& batch, Run run, int shift, Arena&
     PacketState<1> state;
     forward_run<B>(batch, run, basis, state, work);
     Adjoint adjoint;
-    rec.report = {0, 0, double(work.size)};
+    rec.report = {0, 0, double(work.size), double(work.tested)};
     adjoint_of_loss(*batch.loss, state, run.first, run.n, adjoint, rec.report);
     for (size_t v = 0; v < work.visits.size(); ++v) {
         const Hit* h = work.hits.get() + work.first_hit[v];
@@ -225,11 +225,12 @@ template <int B> void observe_run(const Batch& batch, Run run, int shift, Arena&
 }
 
 inline StepReport total_of(const PacketRecord* records, size_t n) {
-    StepReport total{0, 0, 0};
+    StepReport total{0, 0, 0, 0};
     for (size_t i = 0; i < n; ++i) {
         total.squared_error += records[i].report.squared_error;
         total.weight += records[i].report.weight;
         total.samples += records[i].report.samples;
+        total.tested += records[i].report.tested;
     }
     return total;
 }

@@ -87,6 +87,7 @@ struct LeafStatistics {                          // (n_leaves), updated in place
 
 struct StepReport {
     double squared_error, weight, samples;       // summed over rays: weighted squared error, weights, hits
+    double tested;                               // leaves, summed over packets, whose boxes were tested against the rays
 };
 
 struct GradientSink {
