@@ -190,6 +190,18 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
     assert contents(tmp_path / "out") == expected
 
 
+def test_where_nobody_is_left_one_sentence_says_so(tmp_path):
+    with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
+        only = worker()
+        window = Window(found, Job("tests.cluster.work:double", {"seconds": 0.2}), Needs())
+        window.patience = 2.0
+        results = window.results(range(99))
+        assert next(results)[0] == 0
+        only.kill()
+        with pytest.raises(InputError, match="no worker has been fit for 2 s; what was written stays"):
+            list(results)
+
+
 def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
     absent = "import sys; sys.modules['nerfvol'] = None; "
     with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
