@@ -7,7 +7,7 @@ import contextlib
 import statistics
 import time
 import uuid
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Coroutine, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED
 from concurrent.futures import Future as Fetch
 from concurrent.futures import wait as wait_for
@@ -64,7 +64,7 @@ class Window:
         self._asked = -1e9
         self._tasks: dict[Fetch[Any], _Task] = {}
 
-    def results(self, items: Sequence[Any], ahead: Ahead | None = None) -> Iterator[Any]:
+    def results(self, items: Sequence[Any], ahead: Ahead | None = None) -> Generator[Any]:
         """The function's result for each of ``items``, in their order; ``ahead`` has begun with the first of them.
 
         Raises:

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -124,7 +125,7 @@ def test_when_the_only_worker_is_killed_its_successor_goes_on(copies, monkeypatc
     monkeypatch.setattr(engine, "may_copy", lambda: copies)
     with connect("local:1") as found:
         window = Window(found, Job("tests.cluster.work:double", {"seconds": 0.8}), Needs())
-        (process,) = found.run(os.getpid).values()
+        (process,) = cast(dict[str, int], found.run(os.getpid)).values()
         threading.Timer(0.4, os.kill, (process, signal.SIGKILL)).start()
         results = list(window.results(range(3)))
     assert [value for value, _ in results] == [0, 2, 4]
