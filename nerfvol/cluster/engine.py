@@ -33,7 +33,10 @@ SETTINGS = {
     "distributed.scheduler.allowed-failures": 10,  # deaths of workers count against every task that waited there
     "distributed.comm.timeouts.connect": "10s",
     "distributed.admin.log-format": "%(message)s",
-    "distributed.worker.profile.enabled": False,  # it looks at every worker a hundred times a second
+    # What nobody looks at here, in every process: a profile (100 times a second), ticks (50), memory and network (2).
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s",
     # The engine has its processes return freed memory at once, which costs a frame 10 ms of page faults.
     "distributed.nanny.pre-spawn-environ": {
         "OMP_NUM_THREADS": "1",

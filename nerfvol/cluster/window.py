@@ -7,7 +7,7 @@ import contextlib
 import statistics
 import time
 import uuid
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Coroutine, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED
 from concurrent.futures import Future as Fetch
 from concurrent.futures import wait as wait_for
@@ -48,7 +48,8 @@ class _Task:
 class Window:
     """Runs a job on a client's workers. ``messages``: sentences on workers that take no part.
 
-    repeat_late: items that take five times as long as others are given out once more; not where two may not write one folder.
+    patience: seconds without anybody who is fit after which it is given up. repeat_late: items that take five times as long as
+    others are given out once more; not where two may not write one folder.
     """
 
     def __init__(self, client: Client, job: Job, needs: Needs, repeat_late: bool = True) -> None:
@@ -58,15 +59,16 @@ class Window:
         self._times: list[float] = []
         self._fit: list[str] = []
         self._known: set[str] = set()
+        self.patience, self._seen = needs.patience, time.monotonic()
         self._silent: set[str] = set()
         self._asked = -1e9
         self._tasks: dict[Fetch[Any], _Task] = {}
 
-    def results(self, items: Sequence[Any], ahead: Ahead | None = None) -> Iterator[Any]:
+    def results(self, items: Sequence[Any], ahead: Ahead | None = None) -> Generator[Any]:
         """The function's result for each of ``items``, in their order; ``ahead`` has begun with the first of them.
 
         Raises:
-            InputError: the engine is gone, or a task fails wherever it is tried.
+            InputError: the engine is gone or has nobody who is fit any more, or a task fails wherever it is tried.
         """
         ready: dict[int, Done] = {}
         submitted, yielded = 0 if ahead is None else self._taken_over(ahead), 0
@@ -103,6 +105,13 @@ class Window:
             except (KeyError, OSError, ValueError) as error:
                 raise self._gone() from error
             self._asked = time.monotonic()
+            if self._fit:
+                self._seen = self._asked
+            elif self._asked - self._seen > self.patience:
+                raise InputError(
+                    f"--cluster: no worker has been fit for {self.patience:.0f} s; what was written stays, and the same "
+                    "command goes on from there"
+                )
         return [address for address in self._fit if address not in self._silent] or self._fit or [""]
 
     def _group(self, seconds: float = TASK_SECONDS) -> int:

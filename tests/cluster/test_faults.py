@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -124,7 +125,7 @@ def test_when_the_only_worker_is_killed_its_successor_goes_on(copies, monkeypatc
     monkeypatch.setattr(engine, "may_copy", lambda: copies)
     with connect("local:1") as found:
         window = Window(found, Job("tests.cluster.work:double", {"seconds": 0.8}), Needs())
-        (process,) = found.run(os.getpid).values()
+        (process,) = cast(dict[str, int], found.run(os.getpid)).values()
         threading.Timer(0.4, os.kill, (process, signal.SIGKILL)).start()
         results = list(window.results(range(3)))
     assert [value for value, _ in results] == [0, 2, 4]
@@ -188,6 +189,18 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
         assert len(fit.fit_workers(found, resource)) == 1
         assert drawn_by(found, model, tmp_path / "out") == FRAMES
     assert contents(tmp_path / "out") == expected
+
+
+def test_where_nobody_is_left_one_sentence_says_so(tmp_path):
+    with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
+        only = worker()
+        window = Window(found, Job("tests.cluster.work:double", {"seconds": 0.2}), Needs())
+        window.patience = 2.0
+        results = window.results(range(99))
+        assert next(results)[0] == 0
+        only.kill()
+        with pytest.raises(InputError, match="no worker has been fit for 2 s; what was written stays"):
+            list(results)
 
 
 def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
