@@ -120,7 +120,9 @@ def test_shadow_has_a_gradient_of_its_own():
     sigma = medium.sigma_t.clone().requires_grad_()
     o = torch.tensor([[-3.0, 0.0, 0.0]], dtype=torch.float64)
     d = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    out = receive(medium._replace(sigma_t=sigma), (o, d), (Beam((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)),), ISOTROPIC, step=0.1)
+    out = receive(
+        medium._replace(sigma_t=sigma), (o, d), (Beam((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)),), ISOTROPIC, step=0.1
+    )
     out.radiance.sum().backward()
     assert sigma.grad is not None
     above, below = sigma.grad[4, 4, 6], sigma.grad[4, 4, 2]
