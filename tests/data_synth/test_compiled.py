@@ -10,7 +10,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from data_synth import Camera, Path, compiled, integrators, lights, look_at, materials, media, parts, phase, surfaces
+from data_synth import (
+    Camera,
+    Path,
+    compiled,
+    integrators,
+    lights,
+    look_at,
+    materials,
+    media,
+    parts,
+    phase,
+    sample_transmittance,
+    surfaces,
+)
 from data_synth.parts import Part
 from data_synth.scene import Scene
 from tests.fixtures.hypothesis_tests import assert_means, sidak
@@ -152,6 +165,20 @@ def test_alpha_is_the_closed_form(kind):
     for values, want in (([p.rgb[0, 0] for p in runs], 1 - T), ([p.alpha[0, 0] for p in runs], 1 - T.mean())):
         values = np.array(values)
         assert_means(values.mean(axis=0), values.var(axis=0, ddof=1) / len(values), want, bias=ROUNDING)
+
+
+def test_every_pixel_of_a_rough_grid_is_its_closed_form():
+    """Few large cells without any symmetry, whose every corner counts: 1 - T of each pixel's ray, cell by cell."""
+    rho = np.random.default_rng(5).random((4, 3, 5)) ** 3
+    medium = media.grid(rho, (-1.0, -0.8, -1.2), (1.0, 1.0, 1.1), 3.0, 0.0, 1.0)
+    c = camera((1.0, -3.0, 0.7), size=5, focal=8.0)
+    p = Path(spp=30_000, jitter=False).render(Scene(medium=medium), c)
+    want = np.empty((5, 5, 3))
+    for j, i in np.ndindex(5, 5):
+        d = c.c2w[:3, :3] @ [(i + 0.5 - 2.5) / 8, -(j + 0.5 - 2.5) / 8, -1.0]
+        want[j, i] = 1 - sample_transmittance(medium, (1.0, -3.0, 0.7), d / np.linalg.norm(d), method="regular")[0]
+    assert want.std() > 0.1
+    assert_means(p.rgb, p.variance, want, bias=ROUNDING)
 
 
 @pytest.mark.parametrize("eye", [(-3, 0, 0), (3, 0, 0), (0, -3, 0), (0, 3, 0), (1e-9, 0, 3), (0, 1e-9, -3)])

