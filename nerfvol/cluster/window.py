@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import statistics
 import time
 import uuid
@@ -59,6 +60,7 @@ class Window:
         self._times: list[float] = []
         self._fit: list[str] = []
         self._known: set[str] = set()
+        self._look = math.inf
         self.patience, self._seen = needs.patience, time.monotonic()
         self._silent: set[str] = set()
         self._asked = -1e9
@@ -201,17 +203,21 @@ class Window:
     def _repeat_what_found_nobody(self, items: Sequence[Any]) -> None:
         """Gives out again what nobody has once somebody new is fit: a task that was given out while nobody was, or whose only
         worker died, is not looked at again by the scheduler when a resource is added to a worker that it knows."""
-        came = not self._known.issuperset(self._workers())
-        self._known.update(self._fit)
-        if not came:
+        now = time.monotonic()
+        if not self._known.issuperset(self._workers()):
+            self._known.update(self._fit)
+            self._look = now + 1.0  # what was given out a moment ago is on its way to the scheduler
+        if now < self._look:
             return
+        self._look = math.inf
         try:
             processing = cast(dict[str, Any], self.client.processing())
         except (OSError, KeyError, ValueError) as error:
             raise self._gone() from error
         busy = {key for keys in processing.values() for key in keys}
         for fetch, task in list(self._tasks.items()):
-            if task.future is not None and task.future.status == "pending" and task.future.key not in busy:
+            waits = task.future is not None and task.future.status == "pending" and task.future.key not in busy
+            if waits and task.started < now - 0.9:
                 self._release(fetch, self._tasks.pop(fetch))
                 self._submit(items, task.first, task.last, task.attempts)
 
@@ -247,9 +253,10 @@ class Window:
     @staticmethod
     def _release(fetch: Fetch[Any], task: _Task) -> None:
         with contextlib.suppress(Exception):  # the engine may be gone
-            fetch.cancel()
+            if task.future is None or task.future.status != "pending":
+                fetch.cancel()
             if task.future is not None:
-                task.future.cancel(force=True)
+                task.future.cancel(force=True)  # and its fetch ends, where it waits for this
 
     def _gone(self) -> InputError:
         return InputError(
