@@ -38,7 +38,7 @@ class Mutant:
 M = Mutant
 PEOPLE, MASKS, FAULTS = "datasets/test_whatever_people_bring.py", "datasets/test_masks.py", "training/test_faults.py"
 PROGRAMS = "datasets/test_other_programs.py"
-ROUGH = "data_synth/test_rough.py"
+ROUGH, CORE = "data_synth/test_rough.py", "data_synth/test_compiled.py"
 TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.py"
 MUTANTS = (
     # ---------------------------------------------------------------- cameras
@@ -142,6 +142,15 @@ MUTANTS = (
     # ---------------------------------------------------------------- kernels
     M("nerfvol/kernels/csrc/adjoint.h", "g[k] = 2 * weight * residual;", "g[k] = 2 * residual;", "kernels/test_train.py", "gradients without the rays' weights"),
     M("nerfvol/kernels/csrc/train.h", "w = std::max(w, leaf.max_weight);", "w = leaf.max_weight;", "kernels/test_train.py", "the last weight of a leaf is its largest"),
+    M("nerfvol/kernels/csrc/path_trace.h", "beta *= 1.0f / q;", "(void)q;", CORE, "roulette without its weight"),
+    M("nerfvol/kernels/csrc/path_trace.h", "return u * kept < rho - rho * lost;", "return u < rho - rho * lost;", CORE, "grey null collisions at the wrong rate"),
+    M("nerfvol/kernels/csrc/path_trace.h", "(both / n) * fly;", "fly;", CORE, "coloured null collisions without their weight"),
+    M("nerfvol/kernels/csrc/path_trace.h", "if (!kGrey) colour *= kShadowRoulette / T;", "", CORE, "shadow rays that go on by chance weigh too little"),
+    M("nerfvol/kernels/csrc/path_trace.h", "weight *= kQuarter / (kQuarter + float(count) * f);", "weight *= kQuarter / (kQuarter + f);", CORE, "the balance heuristic forgets how many lights there are"),
+    M("nerfvol/kernels/csrc/path_trace.h", "alpha = 1.0 - double(mean3(beta));", "alpha = 1.0 - double(beta[0]);", CORE, "alpha of red alone"),
+    M("nerfvol/kernels/csrc/path_light.h", "cosine = root - 1.0f / root;", "cosine = 2.0f * u - 1.0f;", CORE, "Rayleigh scattering in all directions alike"),
+    M("nerfvol/kernels/csrc/path_medium.h", "const float low = c[0] + fy", "const float low = c[0] + fx", CORE, "an axis of a cell's lower half"),
+    M("nerfvol/kernels/csrc/path_random.h", "mix64(seed + 0xD1B54A32D192ED03u)", "mix64(0xD1B54A32D192ED03u)", CORE, "the seed of a picture"),
     # ---------------------------------------------------------------- data_synth
     M("data_synth/phase.py", "q = 1.0 + g * g - 2.0 * g * cosine", "q = 1.0 + g * g - g * cosine", "data_synth/test_phase.py", "Henyey-Greenstein's denominator"),
     M("data_synth/rough.py", "q = h[2] * h[2] * (a2 - 1.0) + 1.0", "q = h[2] * (a2 - 1.0) + 1.0", ROUGH, "GGX's denominator"),
