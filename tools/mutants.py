@@ -38,7 +38,7 @@ class Mutant:
 M = Mutant
 PEOPLE, MASKS, FAULTS = "datasets/test_whatever_people_bring.py", "datasets/test_masks.py", "training/test_faults.py"
 PROGRAMS, PLAIN = "datasets/test_other_programs.py", "data_synth/test_plain.py"
-ROUGH = "data_synth/test_rough.py"
+ROUGH, CORE = "data_synth/test_rough.py", "data_synth/test_compiled.py"
 TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.py"
 SETS, EXPOSURES, POSE_MASKS = "datasets/test_dataset.py", "starts/test_exposures.py", "poses/test_masks.py"
 MUTANTS = (
@@ -247,6 +247,15 @@ MUTANTS = (
     M("nerfvol/training/splat_trainer.py", "view_of(self._placed(index, view.camera), self.state.origin, near)", "view_of(view.camera, self.state.origin, near)", "training/test_refinement.py", "steps see the given poses"),
     M("nerfvol/training/splat_trainer.py", "self.motions.load_state_dict(state[\"motions\"])", "pass", "training/test_refinement.py", "resumed runs begin with the given poses"),
     M("nerfvol/training/splat_trainer.py", "splats = similar(splats, scale, rotation, shift)", "pass", "training/test_refinement.py", "the scene does not come back with its cameras"),
+    M("nerfvol/kernels/csrc/path_trace.h", "beta *= 1.0f / q;", "(void)q;", CORE, "roulette without its weight"),
+    M("nerfvol/kernels/csrc/path_trace.h", "return u * kept < rho - rho * lost;", "return u < rho - rho * lost;", CORE, "grey null collisions at the wrong rate"),
+    M("nerfvol/kernels/csrc/path_trace.h", "(both / n) * fly;", "fly;", CORE, "coloured null collisions without their weight"),
+    M("nerfvol/kernels/csrc/path_trace.h", "if (!kGrey) colour *= kShadowRoulette / T;", "", CORE, "shadow rays that go on by chance weigh too little"),
+    M("nerfvol/kernels/csrc/path_trace.h", "weight *= kQuarter / (kQuarter + float(count) * f);", "weight *= kQuarter / (kQuarter + f);", CORE, "the balance heuristic forgets how many lights there are"),
+    M("nerfvol/kernels/csrc/path_trace.h", "alpha = 1.0 - double(mean3(beta));", "alpha = 1.0 - double(beta[0]);", CORE, "alpha of red alone"),
+    M("nerfvol/kernels/csrc/path_light.h", "cosine = root - 1.0f / root;", "cosine = 2.0f * u - 1.0f;", CORE, "Rayleigh scattering in all directions alike"),
+    M("nerfvol/kernels/csrc/path_medium.h", "const float low = c[0] + fy", "const float low = c[0] + fx", CORE, "an axis of a cell's lower half"),
+    M("nerfvol/kernels/csrc/path_random.h", "mix64(seed + 0xD1B54A32D192ED03u)", "mix64(0xD1B54A32D192ED03u)", CORE, "the seed of a picture"),
     # ---------------------------------------------------------------- data_synth
     M("data_synth/phase.py", "q = 1.0 + g * g - 2.0 * g * cosine", "q = 1.0 + g * g - g * cosine", "data_synth/test_phase.py", "Henyey-Greenstein's denominator"),
     M("data_synth/rough.py", "q = h[2] * h[2] * (a2 - 1.0) + 1.0", "q = h[2] * (a2 - 1.0) + 1.0", ROUGH, "GGX's denominator"),

@@ -129,6 +129,16 @@ def test_shadow_has_a_gradient_of_its_own():
     assert float(above) < -1e-4 and float(below) == 0
 
 
+def test_light_of_two_suns_is_the_sum_of_each():
+    medium, rays = blob((9, 9, 9)), rays_through(blob((9, 9, 9)), 16, 3)
+    suns = Beam(unit(0.6, 0.1, 0.8), (1.0, 2.0, 3.0)), Beam(unit(-0.3, -0.9, 0.2), (2.0, 1.0, 0.5))
+    both, first, second = (
+        receive(medium, rays, beams, ISOTROPIC, 0.1).radiance for beams in (suns, suns[:1], suns[1:])
+    )
+    np.testing.assert_allclose(both.numpy(), (first + second).numpy(), rtol=1e-12)
+    assert float(first[:, 0].max()) > 1e-3 and float(second[:, 0].max()) > 1e-3
+
+
 def test_steps_converge():
     medium, beams = blob((17, 17, 17)), (Beam(unit(0.3, 0.5, 0.8), (1.0, 1.0, 1.0)),)
     rays = rays_through(medium, 32, 2)
