@@ -219,4 +219,4 @@ def _summed(rows: Float, of: NDArray[np.int64], weight: Float, to: NDArray[np.in
         sums = np.zeros((n, rows.shape[1]))
         compiled.add_rows(np.ascontiguousarray(rows), of, weight, to, sums)
         return sums
-    return np.stack([np.bincount(to, weight * column[of], n) for column in rows.T], 1)
+    return np.stack([np.bincount(to, weight * column[of], n) for column in rows.T], 1).astype(np.float64)
