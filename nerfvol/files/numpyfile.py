@@ -43,7 +43,11 @@ def _read(path: str | os.PathLike[str], what: str, names: Sequence[str]) -> NDAr
             missing = [name for name in names if name not in loaded.files]
             if missing:
                 raise InputError(f"{path}: expected {what}, but it holds no array {missing[0]!r}")
-            return {name: loaded[name] for name in names}
+            found = {name: loaded[name] for name in names}
+            for name, array in found.items():
+                if not isinstance(array, np.ndarray):  # a member that does not begin as arrays do comes as bytes
+                    raise InputError(f"{path}: expected {what}, but its {name!r} is no array")
+            return found
     except InputError:
         raise
     except OSError as error:

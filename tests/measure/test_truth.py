@@ -1,5 +1,7 @@
 """A recovered density against the truth: exact where both are known, and off by what was planted."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -136,3 +138,17 @@ def test_what_is_no_box_is_refused(changed, tmp_path):
     np.savez(tmp_path / "bad.npz", density=np.ones((4, 4, 4)), **box)
     with pytest.raises(InputError, match="expected a box with lo < hi"):
         truth.load_grid(tmp_path / "bad.npz")
+
+
+@pytest.mark.parametrize(
+    "name, content", [("density", b""), ("lo", b"\x93NUMPZ rubbish"), ("voxel_size", b"0.1, 0.1, 0.1")]
+)
+def test_members_that_are_no_arrays_are_refused(tmp_path, name, content):
+    """numpy gives the bytes of what does not begin as an array does."""
+    path = tmp_path / "density.npz"
+    grid = {"density": np.ones((3, 3, 3)), "lo": np.zeros(3), "hi": np.ones(3), "voxel_size": np.full(3, 1 / 3)}
+    np.savez(path, **{key: value for key, value in grid.items() if key != name})
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(f"{name}.npy", content)
+    with pytest.raises(InputError, match=f"density.npz: expected .* but its '{name}' is no array"):
+        truth.load_grid(path)
