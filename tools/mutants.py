@@ -142,12 +142,6 @@ MUTANTS = (
     M("nerfvol/starts/exposures.py", "< COVERED * n", "< 0", EXPOSURES, "what shares nothing is compared"),
     M("nerfvol/training/train.py", "left >= MEASURED_FROM * len(dataset)", "left >= 0", "training/test_appearance.py", "seconds that a run does not have measure exposures"),
     M("nerfvol/training/train.py", "run.phase != config.representation:", "True:", "training/test_appearance.py", "resumed runs measure exposures again"),
-    M("nerfvol/cameras/motions.py", "w - np.cross(pivot, v)", "w + np.cross(pivot, v)", "cameras/test_motions.py", "the gradient of a turn about the pivot"),
-    M("nerfvol/cameras/motions.py", "+ pivot - rotation_of(step[:3]) @ pivot", "", "cameras/test_motions.py", "steps about the camera's centre"),
-    M("nerfvol/cameras/motions.py", "scale * self.poses[:, :3, 3] @ rotation.T + shift", "self.poses[:, :3, 3] @ rotation.T + shift", "cameras/test_motions.py", "cameras come back without the scale"),
-    M("nerfvol/training/splat_trainer.py", "view_of(self._placed(index, view.camera), self.state.origin, near)", "view_of(view.camera, self.state.origin, near)", "training/test_refinement.py", "steps see the given poses"),
-    M("nerfvol/training/splat_trainer.py", "self.motions.load_state_dict(state[\"motions\"])", "pass", "training/test_refinement.py", "resumed runs begin with the given poses"),
-    M("nerfvol/training/splat_trainer.py", "splats = similar(splats, scale, rotation, shift)", "pass", "training/test_refinement.py", "the scene does not come back with its cameras"),
     # ---------------------------------------------------------------- data_synth
     M("data_synth/phase.py", "q = 1.0 + g * g - 2.0 * g * cosine", "q = 1.0 + g * g - g * cosine", "data_synth/test_phase.py", "Henyey-Greenstein's denominator"),
 )  # fmt: skip
