@@ -35,11 +35,12 @@ VIEWS, SPLITS = 3, 4
 NEAR_SHARE = 0.02
 """Of the subject's distance: what is nearer to a camera is not drawn."""
 SECONDS_TO_WRITE = 0.3
-MOTION_PIXELS, MOTION_DECAY = 0.3, 0.1
+MOTION_PIXELS, MOTION_DECAY = 0.4, 0.1
 """Pixels of the present pictures by which a refined camera moves a visit, and the factor at the end: small pictures first,
 which see far, then fine ones."""
-MOTION_FROM = 0.02
-"""Share of progress from which on cameras move, not before every photograph was seen once: fog tells them nothing."""
+MOTION_FROM = 0.15
+"""Share of progress from which on cameras move, not before every photograph was seen once: fog tells them nothing, and moves
+exact poses for as long as it is there."""
 
 
 class SplatTrainer:
