@@ -17,6 +17,7 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from data_synth import (
+        channels,
         clouds,
         lights,
         materials,

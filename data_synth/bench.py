@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from data_synth import bench_mitsuba, scenes
+from data_synth import bench_mitsuba, media, scenes
 from data_synth.dataset import Options, write_dataset
 from data_synth.errors import InputError
 from data_synth.image import Picture, linear_to_srgb, write_png
@@ -55,8 +55,8 @@ def single_scattering(title: str, scene: Scene, size: int, beams: int, repeats: 
         "deep, map of 192": DeepShadow(beams=beams, resolution=192),
     }
     medium = scene.medium
-    if medium is None:
-        raise InputError(f"bench: expected a scene with a medium, {scene.name} has none")
+    if not isinstance(medium, media.Medium):
+        raise InputError(f"bench: expected a scene with one grey medium, {scene.name} has none")
     fine = replace(scene, medium=medium._replace(step=medium.step / 4))
     truth = March(beams=beams).render(fine, camera).rgb
     print(f"\n{title}, {size}x{size}, median of {repeats}")

@@ -25,8 +25,8 @@ SIZE, DEPTH, RUNS = 256, 64, 8
 def theirs(mi: ModuleType, scene: Scene, camera: Camera, spp: int) -> Any:
     """The scene as Mitsuba's, for the variant that is set."""
     m, t = scene.medium, mi.ScalarTransform4f
-    if m is None:
-        raise InputError(f"bench mitsuba: expected a scene with a medium, {scene.name} has none")
+    if not isinstance(m, media.Medium):
+        raise InputError(f"bench mitsuba: expected a scene with one grey medium, {scene.name} has none")
     lo, hi, n = np.array(m.lo), np.array(m.hi), np.array(m.cells) + 1
     middle, half = (lo + hi) / 2, (hi - lo) / 2
     # their samples stand at the centres of cells, ours at the corners of the box

@@ -90,6 +90,20 @@ def gap(a, b, i, points):
     return float(np.sqrt(((seen[0] - seen[1]) ** 2).sum(1).mean()))
 
 
+def test_steps_turn_about_the_pivot():
+    """A gradient of turning alone leaves the pivot where it is seen; one of shifting alone, w = p x v, turns nothing."""
+    motions, still = Motions(ring(), 3.0), ring()[2].c2w
+    motions.step(2, [1.0, -2.0, 0.5, 0.0, 0.0, 0.0], LENS, 5.0)
+    pose = motions.poses[2]
+    pivot = still[:3, 3] - 3 * still[:3, 2]
+    np.testing.assert_allclose((pivot - pose[:3, 3]) @ (pose[:3, :3] * (1, -1, -1)), [0, 0, 3], atol=1e-12)
+    assert np.abs(pose - still).max() > 0.01
+    shifted, v = Motions(ring(), 3.0), np.array([1.0, -2.0, 0.5])
+    shifted.step(2, [*np.cross([0, 0, 3], v), *v], LENS, 5.0)
+    np.testing.assert_allclose(shifted.poses[2][:3, :3], still[:3, :3], atol=1e-12)
+    assert np.abs(shifted.poses[2] - still).max() > 0.01
+
+
 def test_what_all_cameras_do_together_is_undone():
     """A turn, a shift and a growth of scene and cameras together show the same."""
     motions = Motions(ring(), 3.0)
