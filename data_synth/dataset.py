@@ -171,7 +171,7 @@ def _claim(out_dir: Path, record: dict, shared: bool) -> bool:
     plan, text = out_dir / PLAN, json.dumps(record, indent=1)
     if plan.is_file() and plan.read_text() == text:
         return True
-    old = [p for p in out_dir.glob("*/*") if p.parent.name in SPLITS and re.fullmatch(r"\.?r_\d+.*\.(png|exr)", p.name)]
+    old = [p for p in out_dir.glob("*/*") if p.parent.name in SPLITS and re.fullmatch(r"r_\d+.*\.(png|exr)", p.name)]
     marks = [
         p for p in (plan, out_dir / PROVENANCE, out_dir / LIGHTS, *out_dir.glob("transforms_*.json")) if p.is_file()
     ]

@@ -141,6 +141,10 @@ class MediumTrainer:
         """Its memory follows from the settings."""
         return None
 
+    def outcome(self) -> str | None:
+        """What a medium could still learn is not known."""
+        return None
+
     def medium(self) -> Medium:
         """The medium as it is; differentiable in the parameters."""
         side = float((self.hi - self.lo).max()) / (max(self.density.shape) - 1)

@@ -63,6 +63,8 @@ def stages_for(
 
     The schedule as set where it reaches the full pictures by FULL_BY; else the first of these that does: one pruning in each
     stage before them; waiting for it no longer than there is time; that in every other stage; in the first alone.
+    Of photographs it stays as set: what is between the cameras is haze until it was pruned often enough, each step through haze
+    takes several times as long, and a pace so slow would have called for fewer prunings yet.
 
     Args:
         config: the settings, a stage an entry.
@@ -74,6 +76,8 @@ def stages_for(
     full = max(first, config.downscales.index(min(config.downscales)))
     before, after = list(range(first, full)), tuple(range(full, len(config.levels)))
     as_set = Stages((*before, *after), tuple(config.prunes), math.inf)
+    if is_unbounded:
+        return as_set
     once = tuple(min(n, 1) if stage < full else n for stage, n in enumerate(config.prunes))
     shortest = prune_steps(config, steps)
     waits = [max(shortest, enough_tiles(n, is_unbounded) / batch)

@@ -206,6 +206,7 @@ def test_threads_are_set_everywhere():
 TINY = """
 time_budget: none
 threads: 1
+init: direct
 octree:
   steps: 300
   levels: [4, 5, 5]

@@ -189,7 +189,7 @@ def test_a_run_that_is_told_to_end_saves_first(tiny_scene, tmp_path, number):
 
     def say(sentence):
         told.append(sentence)
-        if "training views" in sentence:
+        if "training views of" in sentence:
             os.kill(os.getpid(), number)
 
     with pytest.raises(KeyboardInterrupt):

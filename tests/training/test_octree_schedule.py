@@ -40,6 +40,8 @@ def plans(side: int, views: int = 100):
 def test_the_full_pictures_come_in_the_first_third(side):
     """Whatever the pictures, once there are twenty steps for each of the fewest prunings; the first stage is always there."""
     for config, tiles, steps, unbounded, stages in plans(side):
+        if unbounded:
+            continue
         full = config.downscales.index(1)
         before = [stage for stage in stages.kept if stage < full]
         assert stages.kept[: len(before) + 1] == (*before, full) and stages.kept[-1] == len(config.levels) - 1
@@ -61,6 +63,15 @@ def test_a_run_of_many_steps_is_the_one_that_was_set(side):
             assert stages.wait == float("inf")
     late = stages_for(OctreeConfig(), 4, 10.0, [1e6] * 7, False)
     assert late.kept == (4, 5, 6) and late.prunes == tuple(OctreeConfig().prunes)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_photographs_are_pruned_as_often_as_was_set(side):
+    """However slow the pace: it is slow because of what was not pruned."""
+    for config, _, _, unbounded, stages in plans(side):
+        if unbounded:
+            assert stages.kept == tuple(range(len(config.levels))) and stages.prunes == tuple(config.prunes)
+            assert stages.wait == float("inf")
 
 
 def test_more_steps_never_leave_out_more():
