@@ -76,7 +76,10 @@ SNIPPETS = [
     for path in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
     for i, block in enumerate(blocks(path.read_text()))
 ]
-QUICK = ", init='direct', octree={'steps': 10, 'levels': [4], 'downscales': [2], 'stage_ends': [1.0], 'tiles': [16], 'prunes': [1]}"
+QUICK = (
+    ", init='direct', octree={'steps': 10, 'levels': [4], 'downscales': [2], 'stage_ends': [1.0], 'tiles': [16], "
+    "'prunes': [1]}"
+)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import random
 from collections.abc import Callable
@@ -42,22 +43,25 @@ def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return found
 
 
+def odd(rng: random.Random) -> Any:
+    """A copy: what is damaged next must not be the list itself."""
+    return copy.deepcopy(rng.choice(ODD))
+
+
 def damaged(document: Any, rng: random.Random) -> Any:
     """The document with one to three of its values changed, gone, doubled or moved."""
     document = json.loads(json.dumps(document))
     for _ in range(rng.randint(1, 3)):
         known = places(document)
         if not known:
-            return rng.choice(ODD)
+            return odd(rng)
         *way, last = rng.choice(known)
         parent = document
         for key in way:
             parent = parent[key]
         kind = rng.randrange(5)
         if kind == 0 and isinstance(parent, dict):
-            parent[rng.choice(("format", "frames", "k1", "aabb", "camera_model", "mask_path", "x" * 70))] = rng.choice(
-                ODD
-            )
+            parent[rng.choice(("format", "frames", "k1", "aabb", "camera_model", "mask_path", "x" * 70))] = odd(rng)
         elif kind == 1 and isinstance(parent, (dict, list)):
             del parent[last]
         elif kind == 2 and isinstance(parent[last], (int, float)) and not isinstance(parent[last], bool):
@@ -65,9 +69,9 @@ def damaged(document: Any, rng: random.Random) -> Any:
             with contextlib.suppress(OverflowError):
                 parent[last] = parent[last] * factor + more
         elif kind == 3 and isinstance(parent, list):
-            parent.insert(rng.randrange(len(parent) + 1), parent[last])
+            parent.insert(rng.randrange(len(parent) + 1), copy.deepcopy(parent[last]))
         else:
-            parent[last] = rng.choice(ODD)
+            parent[last] = odd(rng)
     return document
 
 

@@ -78,7 +78,7 @@ def _checked(orbit: dict[str, Any], path: Path) -> dict[str, Any]:
         fits = isinstance(value, list) and len(value) == length and all(is_number(x, least, most) for x in value)
         if not fits or (name == "up" and not any(value or ())):
             raise InputError(f"{path}: its orbit's {name} is {shown(value)}, expected {length} numbers up to {most:g}")
-    return orbit
+    return {name: value for name, value in orbit.items() if value is not None}
 
 
 def open_target(name: str, background: Sequence[float] | None = None) -> Target:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from nerfvol.errors import shown
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.native import need_torch
 
@@ -44,7 +45,7 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[Any, Any]:
     with ArrayFile(path, "checkpoint") as file:
         found = file.document.get("format"), file.document.get("version")
         if found != (_FORMAT, _VERSION):
-            raise file.fault(f"expected {_FORMAT} version {_VERSION}, it says {found[0]!r} version {found[1]!r}")
+            raise file.fault(f"expected {_FORMAT} version {_VERSION}, it says {shown(found[0])} version {shown(found[1])}")
         state = _unpack(file.document.get("tree"), file, 0)
         if not isinstance(state, dict):
             raise file.fault("its outermost value is not a dict")

@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nerfvol.errors import shown
+
 DENSITY_STEP = 0.03
 DENSITY_SOFTNESS = 2.0
 COLOUR_STEP = 1.0 / 64.0
@@ -175,5 +177,5 @@ def _entropy(codes: NDArray[np.int32]) -> float:
 def _number(parameters: Mapping[str, Any], name: str) -> float:
     value = parameters.get(name)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 1e-9 < value < 1e3:
-        raise ValueError(f"its codec parameter {name!r} is {value!r}, expected a positive number")
+        raise ValueError(f"its codec parameter {name!r} is {shown(value)}, expected a positive number")
     return float(value)

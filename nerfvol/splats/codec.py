@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nerfvol.errors import shown
 from nerfvol.octree.codec import TO_GREY, Bytes, pack_codes, plane_name, round_codes, unpack_codes
 from nerfvol.octree.topology import morton
 from nerfvol.splats.points import Y00
@@ -138,5 +139,5 @@ def quaternions(vectors: NDArray[np.floating]) -> NDArray[np.float32]:
 def _number(parameters: Mapping[str, Any], name: str) -> float:
     value = parameters.get(name)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 1e-12 < value < 1e12:
-        raise ValueError(f"its codec parameter {name!r} is {value!r}, expected a positive number")
+        raise ValueError(f"its codec parameter {name!r} is {shown(value)}, expected a positive number")
     return float(value)

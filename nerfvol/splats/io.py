@@ -122,7 +122,7 @@ def describe_splats(path: str | os.PathLike[str]) -> dict[str, Any]:
 def _check_document(file: ArrayFile) -> None:
     document = file.document
     if document.get("format") != FORMAT:
-        raise file.fault(f"expected the format {FORMAT!r}, it says {document.get('format')!r}")
+        raise file.fault(f"expected the format {FORMAT!r}, it says {shown(document.get('format'))}")
     if document.get("version") != VERSION:
         raise file.fault(f"this nerfvol reads version {VERSION}, it has version {document.get('version')!r}")
     expected = (
