@@ -65,9 +65,7 @@ def test_train_by_keywords(tiny_scene, tmp_path):
 
 
 def test_train_by_a_config_which_stays_as_it_is(tiny_scene, tmp_path):
-    config, before = (
-        Config(data=str(tiny_scene), out=str(tmp_path / "a"), init="direct", seed=3) for _ in range(2)
-    )
+    config, before = (Config(data=str(tiny_scene), out=str(tmp_path / "a"), init="direct", seed=3) for _ in range(2))
     run = nerfvol.train(config, out=tmp_path / "b", octree=FEW)
     assert run == tmp_path / "b" and config == before
     assert "seed: 3" in (run / "config.yaml").read_text()

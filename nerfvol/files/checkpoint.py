@@ -45,7 +45,9 @@ def load_checkpoint(path: str | os.PathLike[str]) -> dict[Any, Any]:
     with ArrayFile(path, "checkpoint") as file:
         found = file.document.get("format"), file.document.get("version")
         if found != (_FORMAT, _VERSION):
-            raise file.fault(f"expected {_FORMAT} version {_VERSION}, it says {shown(found[0])} version {shown(found[1])}")
+            raise file.fault(
+                f"expected {_FORMAT} version {_VERSION}, it says {shown(found[0])} version {shown(found[1])}"
+            )
         state = _unpack(file.document.get("tree"), file, 0)
         if not isinstance(state, dict):
             raise file.fault("its outermost value is not a dict")

@@ -46,8 +46,8 @@ def test_pausing_is_no_training_time(tiny_scene, tmp_path):
             if phase.steps_done == 5:
                 shown.training = True
                 shown.pause(True)
-                threading.Timer(pause, shown.pause, (False,)).start()
                 before = run.clock.elapsed(), time.perf_counter()
+                threading.Timer(pause, shown.pause, (False,)).start()
                 super().__call__(run, phase, began_stage)
                 stood.append((run.clock.elapsed() - before[0], time.perf_counter() - before[1]))
             else:
