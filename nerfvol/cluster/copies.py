@@ -3,6 +3,8 @@
 A copy (``fork``) has none of the other threads of its process, and what they had locked stays locked in it. So only a process
 that runs no other thread makes copies, on the one system where they are known to be sound; elsewhere the engine starts
 processes anew (:func:`may_copy`), which import and open everything again.
+
+What is pickled here goes through pipes between a process and its own copies, and is never read from a file.
 """
 
 from __future__ import annotations
