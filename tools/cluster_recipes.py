@@ -184,15 +184,19 @@ def follow_ssh(here: Here) -> None:
     shim = shims / "ssh"  # the page's ssh, that leaves the user's own settings and keys alone
     shim.write_text(f'#!/bin/sh\nexec {shutil.which("ssh", path=ON_PATH)} -F {keys}/config "$@"\n')
     shim.chmod(0o755)
-    sshd = subprocess.Popen(
-        [str(shutil.which("sshd", path=ON_PATH)), "-D", "-e", "-f", keys / "sshd"], stderr=subprocess.DEVNULL
-    )
-    try:
+    variables = {"PATH": f"{shims}{os.pathsep}{ON_PATH}"}
+    with (folder / "sshd.log").open("w+") as log, contextlib.ExitStack() as stack:
+        sshd = subprocess.Popen([str(shutil.which("sshd", path=ON_PATH)), "-D", "-e", "-f", keys / "sshd"], stderr=log)
+        stack.callback(sshd.wait)
+        stack.callback(sshd.terminate)
+        try:  # the page takes a machine that can be reached: this one's sshd needs a moment to listen
+            shell("for k in $(seq 100); do ssh 127.0.0.6 true && exit 0; sleep 0.2; done; exit 1", folder, **variables)
+        except AssertionError as why:
+            ended = "" if sshd.poll() is None else f", sshd ended with code {sshd.poll()}"
+            said = " / ".join([*(folder / "sshd.log").read_text().splitlines()[-5:], *str(why).splitlines()[-2:]])
+            raise Skipped(f"no shell by SSH on 127.0.0.6{ended}: {said}") from None
         (script,) = commands(section("On several machines by SSH"))
-        shell(script, folder, PATH=f"{shims}{os.pathsep}{ON_PATH}")
-    finally:
-        sshd.terminate()
-        sshd.wait()
+        shell(script, folder, **variables)
     here.check(folder)
 
 
@@ -225,18 +229,27 @@ def follow_slurm(here: Here) -> None:
             stack.callback(started.wait)
             stack.callback(started.terminate)
         idle = "for k in $(seq 100); do sinfo -h -o %T 2> /dev/null | grep -q idle && exit 0; sleep 0.2; done; exit 1"
-        stack.callback(shell, f"scancel --user={user}{wait}", folder, **conf)  # before the daemons go
+        stack.callback(shell, f"scancel --user={user} || true{wait}", folder, **conf)  # before the daemons go
         try:
             shell(idle, folder, **conf)
+        except AssertionError:  # the daemons' own affair: slurm.conf is ours, not the page's
+            raise Skipped(f"no idle Slurm node within 20 s: {_logs(folder)}") from None
+        try:
             shell(filled(rows["Slurm array"]) + wait + "mv frames array\n" + script[1], folder, **conf)
         except AssertionError:
-            for log in ("slurmctld.log", "slurmd.log", *(path.name for path in folder.glob("slurm-*.out"))):
-                print(f"--- {log}\n" + "\n".join((folder / log).read_text().splitlines()[-15:]))
+            print(_logs(folder))
             raise
     here.check(folder)
     shutil.rmtree(folder / "frames")
     (folder / "array").rename(folder / "frames")
     here.check(folder)
+
+
+def _logs(folder: Path) -> str:
+    """The last lines of what Slurm's daemons and jobs wrote in a folder."""
+    names = [name for name in ("slurmctld.log", "slurmd.log") if (folder / name).exists()]
+    names += [path.name for path in folder.glob("slurm-*.out")]
+    return "\n".join(f"--- {name}\n" + "\n".join((folder / name).read_text().splitlines()[-15:]) for name in names)
 
 
 def follow_tls(here: Here) -> None:
