@@ -78,9 +78,15 @@ def announce(server: ViewServer, opens: bool) -> None:
               f"ssh -L {server.port}:127.0.0.1:{server.port} THIS_MACHINE", flush=True)  # fmt: skip
     has_screen = sys.platform in ("darwin", "win32") or any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
     if opens and has_screen:  # else a browser for terminals might come
-        import webbrowser
+        threading.Thread(target=_open, args=(server.address,), daemon=True).start()
 
-        threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
+
+def _open(address: str) -> None:
+    """Opens a browser there, or says that there is none."""
+    import webbrowser
+
+    if not webbrowser.open(address):
+        print("no browser could be started: open the address in one", flush=True)
 
 
 def _photographs(name: str, data: str | None) -> Dataset | None:

@@ -100,8 +100,9 @@ class Engine {
       this.lacks.delete("corners");
     }
     if (!parts.includes("values")) return;
-    this.channels(1 + 3 * (d.sh_degree + 1) ** 2, d.n_vertices, file, (index, low, high) =>
-      this.wasm.octree_channel(index, low, high, codec.differences[index]));
+    const channels = 1 + 3 * (d.sh_degree + 1) ** 2;
+    this.channels(channels, d.n_vertices, file, (index, low, high) =>
+      this.wasm.octree_channel(index, channels, low, high, codec.differences[index]));
     this.wasm.octree_rows(codec.density_step, codec.density_softness, codec.sh_step);
     this.lacks.delete("values");
     if (parts.includes("nodes")) this.makeNodes();
@@ -136,7 +137,7 @@ class Engine {
   }
 
   take(name, buffers) {
-    const row = 64 * [1, 1, 2, 4][this.document.sh_degree];
+    const row = 32 * [1, 1, 2, 4][this.document.sh_degree];
     PARTS[name].forEach((number, i) => {
       const at = this.wasm.octree_part(number, number === 3 ? buffers[i].byteLength / row : 0) >>> 0;
       new Uint8Array(this.wasm.memory.buffer, at, buffers[i].byteLength).set(new Uint8Array(buffers[i]));

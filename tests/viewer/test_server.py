@@ -12,6 +12,7 @@ import pytest
 
 from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.cameras.paths import cameras_document, orbit_cameras
+from nerfvol.cli.view import announce
 from nerfvol.datasets.bounds import SceneBounds
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
@@ -45,6 +46,18 @@ def server(shown):
     server.start()
     yield server
     server.close()
+
+
+def test_a_browser_that_is_not_there_is_said(server, monkeypatch, capsys):
+    monkeypatch.setenv("DISPLAY", ":0")
+    for there, said in ((True, ""), (False, "no browser could be started")):
+        monkeypatch.setattr("webbrowser.open", lambda address, there=there: there)
+        announce(server, True)
+        for thread in threading.enumerate():
+            if thread.name.endswith("(_open)"):
+                thread.join()
+        printed = capsys.readouterr().out.splitlines()
+        assert server.address in printed[0] and (printed[1:] == []) == there and said in printed[-1]
 
 
 def ask(server, path, method="GET", body=None, token=True, **headers):

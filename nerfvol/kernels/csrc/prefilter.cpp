@@ -75,13 +75,14 @@ void share_out(float depth, float* sums, int64_t row) {
 }
 
 // What hangs below the nodes of a level: leaves, or nodes.
-struct Cells {
+template <class Number> struct Cells {
     const uint8_t* mask;                   // of the level's nodes
     const int32_t* first;
     int32_t offset;                        // what `first` counts from
     const int32_t* corners;
-    const float *rows, *extinction;
-    std::vector<float> weight;             // opacity of half the level's side
+    const Number* rows;
+    const float* extinction;
+    std::vector<float> weight{};           // opacity of half the level's side
 
     // Of the corners of cells [from, to).
     void weigh(int64_t n_vertices, int64_t from, int64_t to, float side) {
@@ -123,15 +124,15 @@ Prefiltered prefilter(const Tree& t) {
         level.corners.resize(size_t(8 * n));
         const std::vector<int8_t> same(static_cast<size_t>(n), static_cast<int8_t>(l));
         const int64_t n_vertices = number_corners(same.data(), level.ijk.data(), n, int(l), level.corners.data());
-        Cells cells[2] = {{t.leaf_mask, t.first_leaf, 0, t.corners, t.values, sigma.data(), {}}, {}};
+        Cells<RowNumber> leaves{t.leaf_mask, t.first_leaf, 0, t.corners, t.values, sigma.data()};
+        Cells<float> below{};
         const int64_t last_leaf = level.end < t.n_nodes ? t.first_leaf[level.end] : t.n_leaves;
-        cells[0].weigh(t.n_vertices, t.first_leaf[level.start], last_leaf, side);
-        int kinds = 1;
-        if (l + 1 < levels.size()) {
-            const Level& below = levels[l + 1];
-            cells[1] = {t.node_mask, t.first_node, int32_t(level.end), below.corners.data(), below.rows.data(), below.extinction.data(), {}};
-            cells[1].weigh(int64_t(below.extinction.size()), 0, below.end - below.start, side);
-            kinds = 2;
+        leaves.weigh(t.n_vertices, t.first_leaf[level.start], last_leaf, side);
+        const bool parents = l + 1 < levels.size();
+        if (parents) {
+            const Level& next = levels[l + 1];
+            below = {t.node_mask, t.first_node, int32_t(level.end), next.corners.data(), next.rows.data(), next.extinction.data()};
+            below.weigh(int64_t(next.extinction.size()), 0, next.end - next.start, side);
         }
         level.rows.assign(size_t(n_vertices * row), 0);
         std::vector<float> nodes(size_t(n_vertices), 0), sums;
@@ -141,7 +142,8 @@ Prefiltered prefilter(const Tree& t) {
             const int64_t few = std::min<int64_t>(kFewNodes, n - first);
             sums.assign(size_t(8 * few * row), 0);
             std::fill(of_corners.begin(), of_corners.end(), 0.0f);
-            for (int kind = 0; kind < kinds; ++kind) cells[kind].add(level.start + first, few, side, row, sums.data(), depths);
+            leaves.add(level.start + first, few, side, row, sums.data(), depths);
+            if (parents) below.add(level.start + first, few, side, row, sums.data(), depths);
             for (int64_t i = 0; i < few; ++i) {
                 share_out(optical_depth(depths[i]), sums.data() + 8 * row * i, row);
                 for (int c = 0; c < 8; ++c) {
@@ -161,8 +163,9 @@ Prefiltered prefilter(const Tree& t) {
         }
         const int32_t base = int32_t(out.values.size() / size_t(row));
         for (int64_t i = 0; i < 8 * n; ++i) out.corners[size_t(8 * level.start + i)] = base + level.corners[size_t(i)];
+        if (out.values.empty()) out.values.reserve(level.rows.size() * 3 / 2);  // the finest level has most of them
         out.values.insert(out.values.end(), level.rows.begin(), level.rows.end());
-        if (l + 1 < levels.size()) levels[l + 1] = {};
+        if (parents) levels[l + 1] = {};
     }
     return out;
 }

@@ -9,7 +9,7 @@ namespace nerfvol {
 
 struct Prefiltered {
     std::vector<int32_t> corners;          // (n_nodes, 8) rows of values
-    std::vector<float> values;             // (rows, 16 * blocks)
+    std::vector<RowNumber> values;         // (rows, 16 * blocks)
 };
 
 // Of an octree whose masks, first children, corners and values are there.

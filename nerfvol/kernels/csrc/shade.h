@@ -33,6 +33,19 @@ template <int B> struct BasisRows {
     }
 };
 
+// Numbers of a vertex row. Of bfloat16 a shuffle with zeros makes floats.
+inline void read_row(const float* p, f16& v) { read(p, v); }
+inline void read_row(const nerfvol::Bfloat16* p, f4& v) {
+    typedef uint16_t u16x8 __attribute__((vector_size(16)));
+    u16x8 bits{};
+    std::memcpy(&bits, p, 8);
+    v = (f4)__builtin_shufflevector(u16x8{}, bits, 0, 8, 0, 9, 0, 10, 0, 11);
+}
+template <class H> inline void read_row(const nerfvol::Bfloat16* p, Pair<H>& v) {
+    read_row(p, v.lo);
+    read_row(p + sizeof(H) / sizeof(float), v.hi);
+}
+
 // Trilinear weights of the eight corners; corner o is at offsets (o>>2&1, o>>1&1, o&1).
 inline f8 trilinear(float fx, float fy, float fz) {
     const f8 sx = {-1, -1, -1, -1, 1, 1, 1, 1}, ax = {1, 1, 1, 1, 0, 0, 0, 0};
@@ -46,9 +59,9 @@ inline f8 trilinear(float fx, float fy, float fz) {
 template <int B> struct LeafField {
     f16 c[8][B];
 
-    LeafField(const float* values, const int32_t* corners) {
+    LeafField(const RowNumber* values, const int32_t* corners) {
         for (int o = 0; o < 8; ++o)
-            for (int k = 0; k < B; ++k) c[o][k] = load<f16>(values + 16 * (B * int64_t(corners[o]) + k));
+            for (int k = 0; k < B; ++k) read_row(values + 16 * (B * int64_t(corners[o]) + k), c[o][k]);
         for (int axis = 1; axis < 8; axis *= 2)
             for (int o = 0; o < 8; ++o)
                 if (o & axis)

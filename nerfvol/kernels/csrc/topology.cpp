@@ -141,8 +141,9 @@ void interpolate(const float* rows, int64_t width, const int32_t* old_corners, c
     });
 }
 
-void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const int32_t* corners, const float* rows,
-                    int64_t width, const float* weight, int64_t density, float* sums) {
+template <class Number>
+void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const int32_t* corners, const Number* rows, int64_t width,
+                    const float* weight, int64_t density, float* sums) {
     float weights[27][8];
     lattice_weights(weights);
     constexpr int64_t kChunk = 1024;
@@ -168,5 +169,10 @@ void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const 
         }
     });
 }
+
+template void restrict_cells(const uint8_t*, const int32_t*, int64_t, const int32_t*, const float*, int64_t, const float*, int64_t, float*);
+#ifdef NERFVOL_SHORT_ROWS
+template void restrict_cells(const uint8_t*, const int32_t*, int64_t, const int32_t*, const RowNumber*, int64_t, const float*, int64_t, float*);
+#endif
 
 }  // namespace nerfvol

@@ -2,6 +2,8 @@
 #pragma once
 #include <cstdint>
 
+#include "row.h"
+
 namespace nerfvol {
 
 // Place of a corner of a new leaf in the 3x3x3 lattice of the old leaf; octant < 0: the leaf is the old one itself.
@@ -30,7 +32,8 @@ void interpolate(const float* rows, int64_t width, const int32_t* old_corners, c
 // children of n nodes that `mask` names, weighted by `weight` (of each vertex) and the trilinear weight of the place in the
 // node over 8. `first` (n): the number of each node's first such child, corners (children, 8). The slot `density` of a row
 // counts as 1. Absent children add nothing.
-void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const int32_t* corners, const float* rows,
-                    int64_t width, const float* weight, int64_t density, float* sums);
+template <class Number>  // float, RowNumber
+void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const int32_t* corners, const Number* rows, int64_t width,
+                    const float* weight, int64_t density, float* sums);
 
 }  // namespace nerfvol

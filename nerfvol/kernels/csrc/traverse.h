@@ -9,6 +9,7 @@
 namespace NERFVOL_ISA {
 
 using nerfvol::kMaxLevel;
+using nerfvol::RowNumber;
 using nerfvol::Tree;
 
 // A leaf on the packet's way, or a node in place of its leaves (see Cell): its smallest corner, its side and the patches of
@@ -22,7 +23,7 @@ struct Leaf {
 // What a ray crosses: leaf `index`, or node `index - n_leaves` that is drawn in place of its leaves.
 struct Cell {
     const int32_t* corners;
-    const float* values;
+    const RowNumber* values;
 };
 
 inline Cell cell(const Tree& t, int32_t index) {

@@ -3,6 +3,7 @@
 #include <cstdint>
 
 #include "field.h"
+#include "row.h"
 #include "splats.h"
 
 namespace nerfvol {
@@ -17,14 +18,14 @@ struct Tree {
     const uint8_t *node_mask, *leaf_mask;        // (n_nodes)
     const int32_t *first_node, *first_leaf;      // (n_nodes) exclusive prefix sums of the masks' population counts
     const int32_t* corners;                      // (n_leaves, 8) vertex of each corner
-    const float* values;                         // (n_vertices, 16 * blocks) packed SH and raw density
+    const RowNumber* values;                     // (n_vertices, 16 * blocks) packed SH and raw density
     int64_t n_nodes, n_leaves, n_vertices;
     int blocks;                                  // 16-float blocks in a vertex row: 1 (degree 0-1), 2 (degree 2), 4 (degree 3)
     int sh_degree;
     float origin[3], size;                       // root cube, scene units
     float density_scale;                         // 1 / scene unit
     const int32_t* node_corners;                 // (n_nodes, 8) rows of node_values; null where no node is prefiltered
-    const float* node_values;                    // prefiltered values of everything below a node (nerfvol/octree/lod.py)
+    const RowNumber* node_values;                // prefiltered values of everything below a node (nerfvol/octree/lod.py)
     float coarse;                                // a node does where its side is below this many times its distance; 0: none
 };
 

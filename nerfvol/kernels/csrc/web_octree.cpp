@@ -1,6 +1,7 @@
 // An octree in a page: from its compact file's planes to what render.h draws. One instance of the module holds one.
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 
 #include "prefilter.h"
 #include "render.h"
@@ -14,9 +15,9 @@ namespace {
 
 struct {
     std::vector<int32_t> first_node, first_leaf, corners;
-    std::vector<int16_t> codes;            // of the channels, one after the other
+    std::vector<uint64_t> codes;           // of kGroup channels that were read last: kGroup int16 a vertex
     Prefiltered nodes;
-    float* values = nullptr;               // one row more than there are vertices, an empty one
+    RowNumber* values = nullptr;           // one row more than there are vertices, an empty one; until octree_rows a vertex's codes
     Tree tree{};
     struct Hidden {
         int32_t* at;
@@ -25,7 +26,7 @@ struct {
     std::vector<Hidden> hidden;            // what a crop box hides, and the corners it had
 } octree;
 
-constexpr int kDensity = 12;
+constexpr int kDensity = 12, kGroup = 4;
 constexpr float kEmpty = -80;              // raw density that stops nothing
 
 // Masks to first children; 0, or the number of what is wrong (engine.js has the sentences).
@@ -87,21 +88,23 @@ int number_leaves() {
 // Where coefficient k of channel c lies in a vertex row: nerfvol/octree/rows.py.
 int slot(int degree, int k, int c) { return degree == 2 && k == 8 ? 28 + c : 16 * (k / 4) + 4 * c + k % 4; }
 
-// In calls of some rows, as number_corners.
+// From the codes in their places, in calls of some rows, as number_corners.
 __attribute__((noinline)) void fill_rows(int64_t from, int64_t to, float density_step, float softness, float sh_step) {
     const Tree& t = octree.tree;
-    const int64_t row = 16 * t.blocks, n = t.n_vertices;
+    const int64_t row = 16 * t.blocks;
     const int basis = (t.sh_degree + 1) * (t.sh_degree + 1);
     int slots[16][3];
     for (int k = 0; k < basis; ++k)
         for (int c = 0; c < 3; ++c) slots[k][c] = slot(t.sh_degree, k, c);
     for (int64_t v = from; v < to; ++v) {
-        float* at = octree.values + row * v;
-        const int16_t* code = octree.codes.data() + v;
-        at[kDensity] = softness * std::sinh(std::clamp(float(*code) * density_step, -80.0f, 80.0f));
+        RowNumber* at = octree.values + row * v;
+        int16_t code[64];
+        std::memcpy(code, at, size_t(2 * row));
+        std::fill_n(at, row, RowNumber(0));
+        at[kDensity] = softness * std::sinh(std::clamp(float(code[0]) * density_step, -80.0f, 80.0f));
         for (int k = 0; k < basis; ++k) {
-            const float grey = float(code[n * (1 + k)]) * sh_step, red_blue = float(code[n * (1 + basis + k)]) * sh_step;
-            const float green = float(code[n * (1 + 2 * basis + k)]) * sh_step;
+            const float grey = float(code[1 + k]) * sh_step, red_blue = float(code[1 + basis + k]) * sh_step;
+            const float green = float(code[1 + 2 * basis + k]) * sh_step;
             for (int c = 0; c < 3; ++c) at[slots[k][c]] = kFromGrey[0][c] * grey + kFromGrey[1][c] * red_blue + kFromGrey[2][c] * green;
         }
     }
@@ -159,22 +162,28 @@ int octree_open(const uint8_t* node_mask, const uint8_t* leaf_mask, int32_t n_no
     t.size = size;
     t.density_scale = density_scale;
     const int64_t numbers = 16 * t.blocks * t.n_vertices;
-    t.values = octree.values = lines<float>(numbers + 16 * t.blocks);
-    std::fill_n(octree.values, numbers + 16 * t.blocks, 0.0f);
+    t.values = octree.values = lines<RowNumber>(numbers + 16 * t.blocks);
+    std::fill_n(octree.values, numbers + 16 * t.blocks, RowNumber(0));
     octree.values[numbers + kDensity] = kEmpty;
     return 0;
 }
 
-// Channel 0 is density, 1 + axis * K + k a colour; the planes hold one byte a vertex.
+// Channel 0 is density, 1 + axis * K + k a colour, the last is the one before `channels`; the planes hold one byte a vertex. Codes
+// wait in the vertices' own rows, which are as short: there they go some channels at a time, since a row is a cache line.
 NERFVOL_WEB(octree_channel)
-void octree_channel(int channel, const uint8_t* low, const uint8_t* high, int differences) {
-    const int64_t n = octree.tree.n_vertices;
-    octree.codes.resize(size_t(channel + 1) * size_t(n));
-    int16_t* const to = octree.codes.data() + channel * n;
-    unpack_codes(low, high, n, differences != 0, [to](int64_t i, int32_t code) { to[i] = int16_t(code); });
+void octree_channel(int channel, int channels, const uint8_t* low, const uint8_t* high, int differences) {
+    static_assert(sizeof(RowNumber) == sizeof(int16_t), "a row of codes is a row of numbers");
+    const int64_t n = octree.tree.n_vertices, row = 16 * octree.tree.blocks;
+    octree.codes.resize(size_t(n));
+    const int place = channel % kGroup;
+    int16_t* const to = reinterpret_cast<int16_t*>(octree.codes.data()) + place;
+    unpack_codes(low, high, n, differences != 0, [to](int64_t i, int32_t code) { to[kGroup * i] = int16_t(code); });
+    if (place + 1 < kGroup && channel + 1 < channels) return;
+    RowNumber* const at = octree.values + channel - place;
+    for (int64_t v = 0; v < n; ++v) std::memcpy(at + row * v, &octree.codes[size_t(v)], kGroup * sizeof(int16_t));
 }
 
-// The vertices' rows from the channels, a row at a time: each is a cache line or some.
+// The vertices' rows from the codes.
 NERFVOL_WEB(octree_rows) void octree_rows(float density_step, float softness, float sh_step) {
     constexpr int64_t kFew = 4096;
     for (int64_t v = 0; v < octree.tree.n_vertices; v += kFew)
@@ -202,7 +211,8 @@ NERFVOL_WEB(octree_part) void* octree_part(int part, int rows) {
 
 NERFVOL_WEB(octree_part_bytes) uint32_t octree_part_bytes(int part) {
     const Tree& t = octree.tree;
-    const size_t bytes[4] = {32 * size_t(t.n_leaves), 64 * size_t(t.blocks) * size_t(t.n_vertices), 32 * size_t(t.n_nodes), 4 * octree.nodes.values.size()};
+    const size_t row = 16 * size_t(t.blocks) * sizeof(RowNumber);
+    const size_t bytes[4] = {32 * size_t(t.n_leaves), row * size_t(t.n_vertices), 32 * size_t(t.n_nodes), sizeof(RowNumber) * octree.nodes.values.size()};
     return uint32_t(bytes[part]);
 }
 
