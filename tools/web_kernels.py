@@ -32,7 +32,8 @@ OUT = ROOT / "nerfvol" / "viewer" / "kernels.wasm"
 STAMP = OUT.with_suffix(".json")
 FLAGS = (
     "-std=c++17", "-O3", "-msimd128", "-fno-exceptions", "-fno-rtti", "-fno-threadsafe-statics",
-    "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DNERFVOL_ISA=baseline", "-DNERFVOL_SHORT_ROWS", "-Wall", "-Wextra", "-Wno-psabi",
+    "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-DNERFVOL_ISA=baseline", "-DNERFVOL_SHORT_ROWS",
+    "-Wall", "-Wextra", "-Wno-psabi",
 )  # fmt: skip
 LINK = ("-mexec-model=reactor", "-Wl,-z,stack-size=1048576", "-Wl,--gc-sections", "-Wl,--strip-all")
 """Packets of rays overflow the linker's own stack of 64 kB."""
