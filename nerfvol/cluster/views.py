@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerfvol.cameras.camera import Camera
 from nerfvol.cluster.needs import Needs, with_data
 from nerfvol.cluster.share import lend, lent, shared_out
 from nerfvol.cluster.ship import describe
@@ -41,7 +42,10 @@ def evaluate(
     job = Job("nerfvol.cluster.views:score", {**settings, "data": data, "image": on_view is not None}, {"model": file})
     lend(file.path, (model, dataset), file.path)
     indices = scores.scored_views(dataset)
-    results = shared_out(where, job, Needs(data=with_data([data]), room=file.size), indices, say)
+    views = [
+        (index, dataset.cameras[index]) for index in indices
+    ]  # cameras may be other than the files': refined, turned
+    results = shared_out(where, job, Needs(data=with_data([data]), room=file.size), views, say)
     rows = []
     for index, (row, image) in zip(indices, with_progress(results, len(indices)), strict=True):
         rows.append(row)
@@ -50,13 +54,15 @@ def evaluate(
     return scores.summarised(rows)
 
 
-def score(settings: Mapping[str, Any], files: Mapping[str, Path], index: int) -> tuple[dict[str, Any], Any]:
-    """The row of one view, and its render where settings["image"] asks for it. A task (cluster.tasks)."""
-    path = files["model"]
+def score(
+    settings: Mapping[str, Any], files: Mapping[str, Path], view: tuple[int, Camera]
+) -> tuple[dict[str, Any], Any]:
+    """The row of one view, by number and camera, and its render where settings["image"] asks for it. A task (cluster.tasks)."""
+    path, (index, camera) = files["model"], view
     model, dataset = lent(str(path), path) or _opened(json.dumps(dict(settings), sort_keys=True), path)
     started = time.perf_counter()
     drawing = settings["background"], ("rgb",), settings["early_stop_eps"], settings["lod"]
-    image = model.render(dataset.cameras[index], *drawing)["rgb"]
+    image = model.render(camera, *drawing)["rgb"]
     seconds = time.perf_counter() - started
     image = np.clip(image, 0.0, 1.0)
     row = scores.score_view(image, dataset, index, settings["background"], scores.has_colour_maps(model))

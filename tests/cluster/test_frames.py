@@ -3,10 +3,15 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 
+from nerfvol.datasets.frame import Frame
+from nerfvol.datasets.load import load_dataset
 from nerfvol.octree.io import save_octree
 from nerfvol.splats.io import save_splats
+from nerfvol.training.phase import RefinedPoses
+from nerfvol.training.refined import write_refined
 from tests.splats.scenes import random_splats
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -101,6 +106,26 @@ def test_scores_from_workers_are_those_from_here(tmp_path, models, tiny_scene, c
     here, there = ([row | {"seconds": 0} for row in records[name]["rows"]] for name in ("here", "there"))
     assert len(here) > 3 and here == there and records["here"]["psnr"] == records["there"]["psnr"]
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
+
+
+def test_scores_of_refined_cameras_from_workers_are_those_from_here(tmp_path, models, tiny_scene, command):
+    pytest.importorskip("distributed", reason="the engine is the extra nerfvol[cluster]")
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(models / "octree.safetensors", run)
+    (run / "config.yaml").write_text(f"data: {json.dumps(str(tiny_scene))}\n")
+    records = {}
+    for name, more in (("given", ()), ("here", ()), ("there", ("--cluster", "local:2"))):
+        if name == "here":
+            dataset = load_dataset(tiny_scene, "train")
+            poses = np.stack([camera.c2w for camera in dataset.cameras])
+            poses[:, :3, 3] += 0.05
+            refined = RefinedPoses(dataset.names, poses, np.ones(len(poses)))
+            write_refined(run / "refined_poses.json", refined, Frame())
+        record = tmp_path / f"{name}.json"
+        assert command("eval", run, "--split", "train", "--json", record, *more)[0] == 0
+        records[name] = [row | {"seconds": 0} for row in json.loads(record.read_text())["rows"]]
+    assert records["there"] == records["here"] != records["given"]
 
 
 def test_a_synthetic_set_from_workers_is_that_from_here(tmp_path, command):
