@@ -142,17 +142,14 @@ def _scattered(volume: Sparse, counts: tuple[int, int, int]) -> Iterator[tuple[n
     for k in range(0, len(volume.blocks), TOGETHER):
         values = volume.blocks[k : k + TOGETHER]
         values = values.reshape(-1, *values.shape[4:])
-        at = (volume.corner[k : k + TOGETHER, None] + inner).reshape(-1, 3)
-        there = (values != 0).reshape(len(values), -1).any(axis=1) & ((at >= 0) & (at < size)).all(axis=1)
-        at, values = at[there], values[there]
+        there = np.flatnonzero(values if values.ndim == 1 else values.any(axis=1))
+        at = volume.corner[k + (there >> 9)] + inner[there & 511]
+        counted = ((at >= 0) & (at < size)).all(axis=1)
+        at, values = at[counted].T, values[there[counted]]
         brick, inside = at >> 3, at & 7
-        for shared in np.ndindex(2, 2, 2):
-            s = np.array(shared)
-            own = ((s == 0) & (brick < n)) | ((s == 1) & (inside == 0) & (brick > 0))
-            chosen = own.all(axis=1)
-            b, i = brick[chosen] - s, inside[chosen] + BRICK * s
-            yield (
-                (b[:, 0] * n[1] + b[:, 1]) * n[2] + b[:, 2],
-                (i[:, 0] * SIDE + i[:, 1]) * SIDE + i[:, 2],
-                values[chosen],
-            )
+        own = brick < n[:, None], (inside == 0) & (brick > 0)  # of its own brick along an axis, and of the one before
+        for s in np.ndindex(2, 2, 2):
+            chosen = np.flatnonzero(own[s[0]][0] & own[s[1]][1] & own[s[2]][2])
+            b = [brick[axis, chosen] - s[axis] for axis in range(3)]
+            i = [inside[axis, chosen] + BRICK * s[axis] for axis in range(3)]
+            yield (b[0] * n[1] + b[1]) * n[2] + b[2], (i[0] * SIDE + i[1]) * SIDE + i[2], values[chosen]

@@ -19,6 +19,7 @@ from data_synth import (
     Path,
     RenderWarning,
     channels,
+    gather,
     lights,
     look_at,
     media,
@@ -91,13 +92,13 @@ def lit(medium, **kwargs):
     return Scene(medium=medium, lights=BEHIND, **kwargs)
 
 
-def medium(n=5, step=0.02, **grids):
+def medium(n=5, step=0.05, **grids):
     return media.grid(np.ones((n,) * 3), *BOX, tuple(SIGMA), **grids)._replace(step=step)
 
 
 def of_channels(**grids):
     made = channels.rgb_grid(np.broadcast_to(SIGMA, (5, 5, 5, 3)), *BOX, **grids)
-    return made.with_step(0.02)
+    return made.with_step(0.05)
 
 
 def test_nothing_here_is_compiled():
@@ -112,9 +113,9 @@ def test_two_colour_fields_that_know_nothing_of_each_other(make):
     dark = make(albedo=at(albedo), g=at(bend))
     for integrator, own, want in ((Emission(), m, emitted), (March(), m, emitted + bent), (March(), dark, bent)):
         off = np.abs(integrator.render(lit(own), pixel()).rgb[0, 0] - want)
-        half = own.with_step(0.01) if isinstance(own, Channels) else own._replace(step=0.01)
+        half = own.with_step(0.025) if isinstance(own, Channels) else own._replace(step=0.025)
         fine = np.abs(integrator.render(lit(half), pixel()).rgb[0, 0] - want)
-        assert off.max() < (2.0 * 0.02) ** 2 / 3 * want.max()  # h^2 / 24 of J'' and 2 sigma J', J' at most 2 sigma J
+        assert off.max() < (2.0 * 0.05) ** 2 / 3 * want.max()  # h^2 / 24 of J'' and 2 sigma J', J' at most 2 sigma J
         assert (fine < 0.26 * off + 1e-7).all()
     for depth, scene, want in ((0, lit(m), emitted), (1, lit(dark), bent)):
         picture = Path(spp=250, jitter=False, max_depth=depth, textbook=True).render(scene, pixel())
@@ -131,9 +132,10 @@ def test_deep_maps_read_the_fields_and_gathered_light_does_without_g():
     want = (thin * ((1 - a) * e + np.exp(-(x + 1))[:, None] * a * SUN / (4 * np.pi))).sum(axis=0)
     gathered = DeepShadow().render(lit(grey), pixel()).rgb[0, 0]
     assert np.abs(gathered - want).max() < (0.125**2 / 4 + 1e-3) * want.max()
+    assert not gather.possible(lit(media.grid(np.ones((5,) * 3), *BOX, g=at(bend))).world())
     m = medium(albedo=at(albedo), Le=at(glow), g=at(bend))
     mapped = DeepShadow(resolution=17).render(lit(m), pixel()).rgb[0, 0]
-    assert np.abs(mapped - emitted - bent).max() < (2.0 * 0.125) ** 2 / 8 * bent.max() + 2e-3
+    assert np.abs(mapped - emitted - bent).max() < (2.0 * 0.125) ** 2 / 8 * bent.max() + 6e-3
     assert np.abs(bent / even - 1).max() > 0.3  # g matters
 
 
@@ -183,9 +185,10 @@ def test_flakes_are_mixed_and_stay_positive():
         assert np.linalg.eigvalsh(matrices(found))[0] > 0
         d = unit(*rng.normal(size=3))
         assert 0 < media.extinction(m, tuple(p), d) <= m.flake_area
-    flat = np.broadcast_to(sggx.surface((1, 2, 3), 1e-4), (2, 2, 2, 6))  # 1e-8: less than single precision resolves
-    own = media.phase_at(media.grid(np.ones((2,) * 3), *BOX, S=flat), (0.3, 0.2, 0.1)).own
-    assert np.linalg.eigvalsh(matrices(np.array(own)))[0] > 0
+    for axis in rng.normal(size=(40, 3)):  # 1e-8: less than single precision resolves
+        flat = np.broadcast_to(sggx.surface(axis, 1e-4), (2, 2, 2, 6))
+        own = media.phase_at(media.grid(np.ones((2,) * 3), *BOX, S=flat), (0.3, 0.2, 0.1)).own
+        assert np.linalg.eigvalsh(matrices(np.array(own)))[0] > 0
 
 
 @pytest.mark.parametrize("kind", ["g", "S"])
@@ -213,12 +216,13 @@ def test_sampling_at_a_varying_point(kind):
 
 def test_fibres_of_one_density_are_not_taken_for_dust():
     """Their lowest extinction is not their density: residual tracking found e^-rho L for them, whatever their direction."""
-    S = np.broadcast_to(sggx.fibre((1, 0, 0), 0.3), (3, 3, 3, 6))
+    S = np.broadcast_to(sggx.fibre((1, 0, 0), 0.3), (9, 9, 9, 6))  # a whole brick: its lowest density is 1
     want = np.exp(-2.0 * 0.3 * SIGMA)  # along the fibres
-    for m in (
-        media.grid(np.ones((3,) * 3), *BOX, tuple(SIGMA), S=S),
-        media.grid(np.ones((3,) * 3), *BOX, tuple(SIGMA), phase=phase.microflakes(sggx.fibre((1, 0, 0), 0.3))),
+    for made in (
+        media.grid(np.ones((9,) * 3), *BOX, tuple(SIGMA), S=S),
+        media.grid(np.ones((9,) * 3), *BOX, tuple(SIGMA), phase=phase.microflakes(sggx.fibre((1, 0, 0), 0.3))),
     ):
+        m = made._replace(flake_area=1.0)  # which it is, but for rounding
         for method in ("residual", "ratio"):
             T = sample_transmittance(m, EYE, (1.0, 0.0, 0.0), method=method, n=300)
             assert_means(T.mean(axis=0), T.var(axis=0, ddof=1) / len(T), want, bias=1e-6)
