@@ -25,7 +25,7 @@ from numba.core import types
 from numba.extending import intrinsic, overload
 
 from data_synth.errors import InputError, RenderWarning
-from data_synth.jit import jit
+from data_synth.jit import jit, plain
 
 SIGNATURE = "float64(float64, float64, float64)"
 ABOVE, LARGEST, WRONG = range(3)  # what ``Medium.faults`` counts
@@ -46,16 +46,16 @@ COMPILED: dict[int, Compiled] = {}
 
 def address_of(function: Callable) -> int:
     """Where the machine code of ``function(x, y, z)`` is. InputError for what numba cannot compile to it."""
-    plain = getattr(function, "py_func", function)
-    name = getattr(plain, "__qualname__", repr(plain))
+    own = plain(function)
+    name = getattr(own, "__qualname__", repr(own))
     for address, known in COMPILED.items():
-        if known.call is plain:
+        if known.call is own:
             return address
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         address, code = len(COMPILED) + 1, None
     else:
         try:
-            code = numba.cfunc(SIGNATURE, error_model="numpy")(plain)
+            code = numba.cfunc(SIGNATURE, error_model="numpy")(own)
         except Exception as error:  # numba raises whatever its passes do
             why = (str(error).splitlines() or [""])[0][:200]
             raise InputError(
@@ -63,10 +63,10 @@ def address_of(function: Callable) -> int:
             ) from error
         address = int(cast(int, code.address))
     try:
-        source = textwrap.dedent(inspect.getsource(plain))
+        source = textwrap.dedent(inspect.getsource(own))
     except (OSError, TypeError):
         source = ""
-    COMPILED[address] = Compiled(name, source, plain, code)
+    COMPILED[address] = Compiled(name, source, own, code)
     return address
 
 
