@@ -47,7 +47,7 @@ class Channels(NamedTuple):
 
     @property
     def Le(self) -> np.ndarray:
-        """(1, 3) what it emits, the same everywhere."""
+        """(1, 3) what it emits where that is the same everywhere."""
         return np.array([[m.Le[0, c] for c, m in enumerate(self)]])
 
     def with_step(self, step: float) -> Channels:
@@ -57,10 +57,10 @@ class Channels(NamedTuple):
 
 def rgb_grid(
     sigma_t: ArrayLike, lo: Point, hi: Point, albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0,
-    phase: phases.Phase | None = None,
+    phase: phases.Phase | None = None, g: ArrayLike | None = None, S: ArrayLike | None = None,
 ) -> Channels:  # fmt: skip
-    """Extinction (nx, ny, nz, 3) in 1/u and albedo, the same shape or one RGB, at the vertices of a grid from lo to hi; each
-    channel of both is trilinear in between. Le: RGB, the same everywhere."""
+    """Extinction (nx, ny, nz, 3) in 1/u, albedo and Le, each of the same shape or one RGB, at the vertices of a grid from lo to
+    hi; each channel of all is trilinear in between. g, S: as those of ``media.grid``, the same for all channels."""
     sigma_t = np.asarray(sigma_t, float)
     if sigma_t.ndim != 4 or sigma_t.shape[3] != 3:
         raise InputError(f"rgb_grid: sigma_t must have the shape (nx, ny, nz, 3), got {sigma_t.shape}")
@@ -69,20 +69,34 @@ def rgb_grid(
         raise InputError(f"rgb_grid: albedo must have the shape of sigma_t or be one colour, got {albedo.shape}")
     if not (np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1):
         raise InputError("rgb_grid: albedo must be in [0, 1]")
-    glow = rgb(Le, "Le")
+    if np.ndim(Le) > 1 and np.shape(Le) != sigma_t.shape:
+        raise InputError(f"rgb_grid: Le must have the shape of sigma_t or be one colour, got {np.shape(Le)}")
+    glow = np.asarray(Le, float) if np.ndim(Le) > 1 else np.array(rgb(Le, "Le"))
     whole = albedo if albedo.shape == sigma_t.shape else np.broadcast_to(albedo, sigma_t.shape)
     table = np.array([[0.0] * 3, [1.0] * 3])  # the attribute of a channel's medium is its albedo
 
     def channel(c: int) -> Medium:
-        m = media.grid(sigma_t[..., c], lo, hi, 1.0, 0.0, glow[c], phase, attribute=whole[..., c])
+        m = media.grid(
+            sigma_t[..., c],
+            lo,
+            hi,
+            1.0,
+            0.0,
+            glow[..., c] if glow.ndim > 1 else glow[c],
+            phase,
+            attribute=whole[..., c],
+            g=g,
+            S=S,
+        )
         return m._replace(albedo=table)
 
     return Channels(channel(0), channel(1), channel(2))
 
 
 def rgb_coefficients(
-    sigma_a: ArrayLike, sigma_s: ArrayLike, lo: Point, hi: Point, Le: ArrayLike = 0.0, phase: phases.Phase | None = None
-) -> Channels:
+    sigma_a: ArrayLike, sigma_s: ArrayLike, lo: Point, hi: Point, Le: ArrayLike = 0.0, phase: phases.Phase | None = None,
+    g: ArrayLike | None = None, S: ArrayLike | None = None,
+) -> Channels:  # fmt: skip
     """As ``rgb_grid``, of absorption and scattering (nx, ny, nz, 3) in 1/u; extinction and albedo are interpolated."""
     absorbed, scattered = np.asarray(sigma_a, float), np.asarray(sigma_s, float)
     if absorbed.shape != scattered.shape:
@@ -91,7 +105,7 @@ def rgb_coefficients(
         raise InputError("rgb_coefficients: expected coefficients from 0 on")
     total = absorbed + scattered
     albedo = np.divide(scattered, total, out=np.zeros_like(total), where=total > 0)
-    return rgb_grid(total, lo, hi, albedo, Le, phase)
+    return rgb_grid(total, lo, hi, albedo, Le, phase, g, S)
 
 
 def split(scene: Scene) -> list[Scene] | None:

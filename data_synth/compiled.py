@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from data_synth import lights, phase
-from data_synth.media import BRICK, GRID, Medium
+from data_synth.media import BRICK, FUNCTION, GRID, Medium
 from data_synth.parts import BLOCK
 from data_synth.world import has_boundaries, has_surfaces
 
@@ -49,6 +49,10 @@ def unknown(w: World) -> str:
         return "surfaces"
     if has_boundaries(w) or w.ambient != 0:
         return "boundaries"
+    if m.kind == FUNCTION:
+        return "a density function"
+    if m.columns.width:
+        return "grids of albedo, Le, g or S"
     if m.phase.kind not in PHASES:
         return "microflakes"
     if max(abs(m.phase.g1), abs(m.phase.g2)) > MOST_FORWARD:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_synth import truth
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.files import remove_leftovers, replacing
@@ -218,6 +219,7 @@ def _provenance(scene: Renderable, options: Options) -> dict:
         "size": list(options.size),
         "seed": options.seed,
         **({"suns": options.suns} if options.suns else {}),
+        **({"truth": truth.described(scene)} if isinstance(scene, Scene) else {}),
         "versions": {
             "data_synth": importlib.import_module("data_synth").__version__,
             "numpy": np.__version__,

@@ -12,7 +12,7 @@ import math
 from data_synth import phase
 from data_synth.jit import jit
 from data_synth.lights import POINT, column3
-from data_synth.media import attribute, extinction, lookup
+from data_synth.media import albedo_at, attribute, extinction, phase_at
 from data_synth.rng import uniform
 from data_synth.trackers import shadow_transmittance
 from data_synth.vec import along, dot, extent, largest, mul, neg, scale, sub
@@ -79,9 +79,9 @@ def in_segment(w, m, ray, t0, t1, inside, beta, rng):
     r2 = dot(to, to)
     r = math.sqrt(r2)
     wi, at = scale(1.0 / r, to), attribute(m, p)
-    f = phase.evaluate(m.phase, at, wo, wi, rng)
+    f = phase.evaluate(phase_at(m, p), at, wo, wi, rng)
     value = (1.0 - share(sigma, pdf, count, points)) * points * rho * f / (pdf * r2)
-    L = scale(value, mul(mul(m.sigma_t, lookup(m.albedo, at)), column3(w.lights, k, 4)))
+    L = scale(value, mul(mul(m.sigma_t, albedo_at(m, p, at)), column3(w.lights, k, 4)))
     if largest(mul(beta, L)) <= 0.0:
         return (0.0, 0.0, 0.0)
     L = mul(L, shadow_transmittance(m, ray, t, True, rng))

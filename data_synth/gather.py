@@ -8,7 +8,7 @@ the next, so that once per view all of J is put down there next to rho, and a ma
 however many beams there are.
 
 An approximation: J is linear between samples. Its error falls with the square of the cell, at a shadow's edge with the
-cell. Not gathered are coloured extinction, microflakes, media that fill boundary surfaces, and lights at a finite
+cell. Not gathered are coloured extinction, microflakes, a grid of g, media that fill boundary surfaces, and lights at a finite
 distance.
 """
 
@@ -22,12 +22,14 @@ import numpy as np
 from data_synth import media, sweep
 from data_synth import phase as phases
 from data_synth.cameras import pixel_ray
+from data_synth.fields import at_sample
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
 from data_synth.media import BRICK, GRID, Medium, box_interval, lookup, triple
 from data_synth.rng import new_rng
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, mul, sub, unit
+from data_synth.volumes import is_large
 from data_synth.world import SURFACES, World, has_boundaries, has_surfaces, visible
 
 OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
@@ -48,7 +50,8 @@ def possible(w: World) -> bool:
     m = w.medium
     grey = m.sigma_t[0] == m.sigma_t[1] == m.sigma_t[2]
     distant = bool(np.all(w.lights[:, 0] == DIRECTIONAL))
-    return m.kind == GRID and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not has_boundaries(w)
+    one_phase = m.phase.kind < phases.SGGX_SPECULAR and m.columns.g < 0
+    return m.kind == GRID and grey and distant and one_phase and not has_boundaries(w) and not is_large(m)
 
 
 def outside(m: Medium, eye: np.ndarray) -> bool:
@@ -137,8 +140,10 @@ def _sum_beams(w, gathered, eye, row, rho_J, first, last):
             add_beam(m.phase, wi, L, part, row[0], row[1], row[2], row[3], row[4], row[5], row[6])
         for s in range(SAMPLES):
             a = m.attributes[at + s] if m.attributes.size > 1 else 0.0
-            albedo = lookup(m.albedo, a)
-            emitted = mul(sub((1.0, 1.0, 1.0), albedo), lookup(m.Le, a))
+            c = m.columns
+            albedo = at_sample(m, c.albedo, c.albedo_step, at + s) if c.albedo >= 0 else lookup(m.albedo, a)
+            Le = at_sample(m, c.Le, c.Le_step, at + s) if c.Le >= 0 else lookup(m.Le, a)
+            emitted = mul(sub((1.0, 1.0, 1.0), albedo), Le)
             J = add(emitted, mul(albedo, (row[4, s], row[5, s], row[6, s])))
             rho_J[4 * (at + s)] = m.samples[at + s]
             for c in range(3):

@@ -22,6 +22,7 @@ import numpy as np
 from data_synth import channels, compiled, gather, march, parts, path, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
+from data_synth.functions import say_faults
 from data_synth.gather import Gathered
 from data_synth.image import Picture
 from data_synth.jit import in_bands
@@ -97,7 +98,9 @@ class March:
             else:
                 march.render_rows(world, lighting, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last)
 
-        return _banded(rows, out, part, 4)
+        out = _banded(rows, out, part, 4)
+        _say_faults(world)
+        return out
 
     def picture(self, sums: np.ndarray) -> Picture:
         """See Integrator."""
@@ -191,7 +194,9 @@ class Path:
         def rows(first: int, last: int) -> None:
             path.render_rows(world, data, settings, new_rng(0, 0), np.empty((64, 8)), out, first, last)
 
-        return _banded(rows, out, part, 2)
+        out = _banded(rows, out, part, 2)
+        _say_faults(world)
+        return out
 
     def picture(self, sums: np.ndarray) -> Picture:
         """See Integrator; with the variance of the mean."""
@@ -205,6 +210,11 @@ def _banded(rows: Callable[[int, int], None], out: np.ndarray, part: Part, band:
     """The part's rows of ``out`` once ``rows`` has filled them, on all cores; of others not even memory is used."""
     in_bands(lambda first, last: rows(part.top + first, part.top + last), part.bottom - part.top, band)
     return out if part.bottom - part.top == len(out) else out[part.top : part.bottom].copy()
+
+
+def _say_faults(world: World) -> None:
+    say_faults(world.medium.faults)
+    say_faults(world.others.faults)
 
 
 INTEGRATORS: dict[str, Callable[..., Integrator]] = {

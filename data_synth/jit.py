@@ -36,6 +36,11 @@ OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 jit = numba.njit(**OPTIONS)
 
 
+def plain(function: Callable) -> Callable:
+    """The Python function that a compiled one is made of; itself where nothing is compiled."""
+    return getattr(function, "py_func", function)
+
+
 @cache
 def _imported(path: Path) -> frozenset[Path]:
     """The files of this package that a source file imports from."""

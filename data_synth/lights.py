@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from data_synth.checks import direction, vector
 from data_synth.errors import InputError
-from data_synth.jit import jit
+from data_synth.jit import jit, plain
 from data_synth.media import rgb
 from data_synth.rng import uniform
 from data_synth.surfaces import RELATIVE
@@ -123,7 +123,7 @@ def sky_blend(zenith, horizon, ground, dz):
 
 def sky_radiance(row: np.ndarray, d: Sequence[float]) -> tuple[float, float, float]:
     """Radiance of a sky light's row from direction d."""
-    return sky_blend.py_func(tuple(row[4:7]), tuple(row[7:10]), tuple(row[10:13]), d[2])
+    return plain(sky_blend)(tuple(row[4:7]), tuple(row[7:10]), tuple(row[10:13]), d[2])
 
 
 @jit

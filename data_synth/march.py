@@ -22,7 +22,7 @@ from data_synth.gather import OPAQUE, Clear, march_gathered
 from data_synth.jit import jit, kernel
 from data_synth.lights import escaped, quad_radiance, sample_light
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE
-from data_synth.media import attribute, box_interval, extinction, lookup
+from data_synth.media import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.rng import reseed
 from data_synth.shadowmap import ShadowMaps, look_up
 from data_synth.spongecake import attenuation
@@ -87,13 +87,13 @@ def preview_source(m, p, wi, wo, a, rng):
             d += width * extinction(m, q, wi) * m.sigma_t[1]
     beer = max(math.exp(-d), 0.7 * math.exp(-0.25 * d))
     powder = 1.0 - math.exp(-2.0 * d - 0.5)
-    return 2.0 * beer * powder * phase.evaluate(m.phase, a, wo, wi, rng)
+    return 2.0 * beer * powder * phase.evaluate(phase_at(m, p), a, wo, wi, rng)
 
 
 @jit
 def scattered_light(w, m, p, wo, a, step, rng):
     """sum over lights of f_p L_i T_light at a point of medium m."""
-    total, mode = (0.0, 0.0, 0.0), step.lighting.mode
+    total, mode, f_p = (0.0, 0.0, 0.0), step.lighting.mode, phase_at(m, p)
     for k in range(w.lights.shape[0]):
         wi, distance, radiance, _ = sample_light(w.lights, k, p, rng)
         if largest(radiance) <= 0.0:
@@ -106,7 +106,7 @@ def scattered_light(w, m, p, wo, a, step, rng):
         else:
             shadow = visible(w, (p, wi), distance * NEAR, step.inside, MARCHED, rng)
         if largest(shadow) > 0.0:
-            total = add(total, mul(scale(phase.evaluate(m.phase, a, wo, wi, rng), radiance), shadow))
+            total = add(total, mul(scale(phase.evaluate(f_p, a, wo, wi, rng), radiance), shadow))
     return total
 
 
@@ -119,7 +119,7 @@ def scatter_event(m, ray, t, width, state, context):
     if rho <= 0.0:
         return state, False
     a = attribute(m, p)
-    albedo, Le = lookup(m.albedo, a), lookup(m.Le, a)
+    albedo, Le = albedo_at(m, p, a), Le_at(m, p, a)
     scattered = (0.0, 0.0, 0.0)
     if step.lighting.mode != UNLIT and largest(albedo) > 0.0:
         scattered = scattered_light(w, m, p, wo, a, step, rng)

@@ -1,7 +1,8 @@
 """Participating media (PHYSICS 5): where the coefficients are, and how a kernel looks them up.
 
 A medium has a dimensionless density rho(x) >= 0, constant RGB extinction per density sigma_t in 1/u, and RGB albedo and
-emitted radiance Le that may depend on a second field, the *attribute* in [0, 1] (a temperature, a tissue, a thread):
+emitted radiance Le that may depend on a second field, the *attribute* in [0, 1] (a temperature, a tissue, a thread), or
+be grids of their own, as g and S of the phase function may (``fields.py``):
     sigma_t(x) = sigma_t rho(x),  sigma_s = albedo sigma_t,  sigma_a = sigma_t - sigma_s,  emission = sigma_a Le.
 Microflakes multiply the extinction by their projected area towards the ray.
 
@@ -14,21 +15,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from data_synth import phase as phases
+from data_synth.bricks import BRICK, SIDE, Sparse, bricks, cut_to
 from data_synth.checks import vector
 from data_synth.errors import InputError
+from data_synth.fields import NOTHING, Columns, Given, cell_at, colour, is_grid, matrices, matrix, mixed, stored
+from data_synth.functions import address_of, bounded
 from data_synth.jit import jit
 from data_synth.sggx import projected_area
-from data_synth.vec import slab, trilinear
+from data_synth.vec import slab
 
 Point = Sequence[float] | np.ndarray
-BRICK = 8
-HOMOGENEOUS, GRID, EXPONENTIAL = range(3)
+HOMOGENEOUS, GRID, EXPONENTIAL, FUNCTION = range(4)
 
 
 class Medium(NamedTuple):
@@ -37,7 +40,8 @@ class Medium(NamedTuple):
     bricks: bricks per axis; brick_size: their edges in u; cell: edges of a cell in u; offsets: (bricks,) first sample
     of a brick or -1; samples, attributes: float32; brick_max, brick_min: (bricks,) bounds of the density; sigma_t: RGB
     per density; albedo, Le: (K, 3) tables over the attribute; base, falloff: of the exponential; step: length of a
-    marching step in u; flake_area: largest projected area of the microflakes (1 without).
+    marching step in u; flake_area: largest projected area of the microflakes (1 without). fields, columns: the samples of
+    ``fields.py``. function: address of a density function (``functions.py``); faults: (3,) what is wrong with it.
     """
 
     kind: int
@@ -60,6 +64,10 @@ class Medium(NamedTuple):
     step: float
     flake_area: float
     phase: phases.Phase
+    fields: np.ndarray
+    columns: Columns
+    function: int
+    faults: np.ndarray
 
 
 def triple(values: Iterable[float]) -> tuple[float, float, float]:
@@ -108,26 +116,78 @@ def exponential(
 
 
 def grid(
-    density: ArrayLike, lo: Point, hi: Point, sigma_t: ArrayLike = 1.0, albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0,
-    phase: phases.Phase | None = None, attribute: ArrayLike | None = None, majorant: float | None = None,
+    density: ArrayLike | Sparse, lo: Point, hi: Point, sigma_t: ArrayLike = 1.0, albedo: ArrayLike | Sparse = 0.0,
+    Le: ArrayLike | Sparse = 0.0, phase: phases.Phase | None = None, attribute: ArrayLike | Sparse | None = None,
+    majorant: float | None = None, g: ArrayLike | Sparse | None = None, S: ArrayLike | None = None,
 ) -> Medium:  # fmt: skip
     """A heterogeneous medium of (nx, ny, nz) density samples at the vertices of a regular grid from lo to hi.
 
-    attribute: same shape, in [0, 1]. majorant: an upper bound the caller believes in; lower is an error.
+    attribute: same shape, in [0, 1]. albedo, Le: a colour, a table of colours over the attribute, or grids of the density's
+    shape or with three channels. g: a grid of mean cosines, of the first lobe if ``phase`` has two. S: (nx, ny, nz, 6) SGGX
+    matrices. majorant: an upper bound the caller believes in; lower is an error.
     """
-    density = np.asarray(density)
-    if density.ndim != 3 or min(density.shape) < 2:
+    density = density if isinstance(density, Sparse) else np.asarray(density)
+    if len(density.shape) != 3 or min(density.shape) < 2:
         raise InputError(f"medium: density must be a 3D array of at least 2 samples a side, got shape {density.shape}")
-    if not np.isfinite(density).all() or density.min() < 0:
+    if not (math.isfinite(density.min()) and math.isfinite(density.max())) or density.min() < 0:
         raise InputError("medium: density must be finite and not negative, got a negative, infinite or NaN sample")
     if majorant is not None and majorant < density.max():
         raise InputError(f"medium: majorant {majorant:g} lies below the largest density {density.max():g}")
-    if attribute is not None and np.shape(attribute) != density.shape:
-        raise InputError(f"medium: attribute must have the density's shape {density.shape}, got {np.shape(attribute)}")
-    stored = _bricks(density.astype(np.float32), attribute)
-    cells = tuple(n - 1 for n in density.shape)
-    medium = _medium(GRID, lo, hi, cells, stored[:2], sigma_t, albedo, Le, phase)
-    return medium._replace(offsets=stored[2], samples=stored[3], attributes=stored[4])
+    found = attribute.shape if isinstance(attribute, Sparse) else np.shape(attribute) if attribute is not None else None
+    if found is not None and found != density.shape:
+        raise InputError(f"medium: attribute must have the density's shape {density.shape}, got {found}")
+    b = bricks(density if isinstance(density, Sparse) else density.astype(np.float32, copy=False))
+    given = Given(albedo if is_grid(albedo) else None, Le if is_grid(Le) else None, g, S)
+    columns, fields, area = stored(given, density.shape, b.kept)
+    phase = _varying(phase, g is not None, S is not None)
+    table = 0.0 if given.albedo is not None else cast(ArrayLike, albedo)
+    glow = 0.0 if given.Le is not None else cast(ArrayLike, Le)
+    nx, ny, nz = density.shape
+    cells = (nx - 1, ny - 1, nz - 1)
+    medium = _medium(GRID, lo, hi, cells, (b.top, b.bottom), sigma_t, table, glow, phase)
+    attributes = np.zeros(1, np.float32) if attribute is None else cut_to(attribute, b.kept).astype(np.float32).ravel()
+    return medium._replace(
+        offsets=b.offsets, samples=b.samples, attributes=attributes, fields=fields, columns=columns,
+        flake_area=area if S is not None else medium.flake_area,
+    )  # fmt: skip
+
+
+def _varying(phase: phases.Phase | None, g: bool, S: bool) -> phases.Phase | None:
+    """The phase function that a grid of g or S belongs to."""
+    if g and S:
+        raise InputError("medium: expected a grid of g or of S, got both")
+    if S:
+        phase = phase or phases.microflakes(np.eye(3))
+        if phase.kind not in (phases.SGGX_SPECULAR, phases.SGGX_DIFFUSE):
+            raise InputError("medium: a grid of S belongs to microflakes, got another phase function")
+    if g:
+        phase = phase or phases.henyey_greenstein(0.0)
+        if phase.kind != phases.HG:
+            raise InputError("medium: a grid of g belongs to a Henyey-Greenstein phase function, got another")
+    return phase
+
+
+def procedural(
+    function: Callable[[float, float, float], float], lo: Point, hi: Point, majorant: ArrayLike, sigma_t: ArrayLike = 1.0,
+    albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0, phase: phases.Phase | None = None, step: float | None = None,
+) -> Medium:  # fmt: skip
+    """Density function(x, y, z), in world units, evaluated where it is needed (``functions.py``).
+
+    majorant: an upper bound of the density in the box, or of each of (bx, by, bz) equal boxes that make it up: the better they
+    bound it, the fewer look-ups tracking takes, and none where it is 0. step: of marching, u; by default a 128th of the box.
+    """
+    top = np.asarray(majorant, float)
+    top = top.reshape(1, 1, 1) if top.ndim == 0 else top
+    if top.ndim != 3 or not top.size or not np.isfinite(top).all() or top.min() < 0:
+        raise InputError(
+            f"procedural: expected a majorant, or one for each of a grid of boxes, from 0 on, got {majorant}"
+        )
+    if step is not None and not 0 < step < math.inf:
+        raise InputError(f"procedural: expected a positive step, got {step}")
+    a, b, c = top.shape
+    bounds = (top.ravel(), np.zeros(top.size))
+    medium = _medium(FUNCTION, lo, hi, (a, b, c), bounds, sigma_t, albedo, Le, phase)
+    return medium._replace(function=address_of(function), step=medium.step if step is None else step)
 
 
 def from_function(function: Callable, lo: Point, hi: Point, resolution: int = 128, **coefficients: Any) -> Medium:
@@ -140,27 +200,6 @@ def from_function(function: Callable, lo: Point, hi: Point, resolution: int = 12
     return grid(density, lo, hi, **coefficients)
 
 
-def _bricks(density: np.ndarray, attribute: ArrayLike | None) -> tuple[np.ndarray, ...]:
-    cells = np.array(density.shape) - 1
-    counts = -(-cells // BRICK)
-    padding = [(0, int(n * BRICK - c)) for n, c in zip(counts, cells, strict=True)]
-
-    def cut(a: np.ndarray) -> np.ndarray:  # (bricks, 9, 9, 9) overlapping windows
-        windows = np.lib.stride_tricks.sliding_window_view(np.pad(a, padding), (BRICK + 1,) * 3)
-        return windows[::BRICK, ::BRICK, ::BRICK].reshape(-1, (BRICK + 1) ** 3)
-
-    blocks = cut(density)
-    top, bottom = blocks.max(axis=1), blocks.min(axis=1)
-    kept = np.flatnonzero(top > 0)
-    offsets = np.full(len(blocks), -1, dtype=np.int64)
-    offsets[kept] = np.arange(len(kept)) * (BRICK + 1) ** 3
-    attributes = np.zeros(1, np.float32)
-    if attribute is not None:
-        attributes = np.ascontiguousarray(cut(np.asarray(attribute, np.float32))[kept]).ravel()
-    samples = np.ascontiguousarray(blocks[kept]).ravel()
-    return top.astype(float), bottom.astype(float), offsets, samples, attributes
-
-
 def _medium(
     kind: int, lo: Point, hi: Point, cells: tuple[int, int, int], bounds: Sequence[np.ndarray],
     sigma_t: ArrayLike, albedo: ArrayLike, Le: ArrayLike, phase: phases.Phase | None,
@@ -169,7 +208,7 @@ def _medium(
     if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"medium: expected a box with lo < hi, got {lo} and {hi}")
     phase = phase or phases.isotropic()
-    area = math.sqrt(max(np.linalg.eigvalsh(_matrix(s))[-1] for s in phase.S))
+    area = math.sqrt(np.linalg.eigvalsh(matrices(phase.S))[:, -1].max())
     cell = triple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
     nx, ny, nz = (-(-n // BRICK) for n in cells) if kind == GRID else cells
     step = min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
@@ -178,41 +217,38 @@ def _medium(
         np.zeros(1, np.int64), np.zeros(1, np.float32), np.zeros(1, np.float32),
         np.ascontiguousarray(bounds[0], dtype=float), np.ascontiguousarray(bounds[1], dtype=float),
         float(np.max(bounds[0], initial=0.0)), rgb(sigma_t, "sigma_t"), _table(albedo, "albedo", 1.0),
-        _table(Le, "Le"), 0.0, 0.0, step, area, phase,
+        _table(Le, "Le"), 0.0, 0.0, step, area, phase, np.zeros(1, np.float32), NOTHING, 0, np.zeros(3),
     )  # fmt: skip
 
 
-def _matrix(s: Sequence[float]) -> np.ndarray:
-    return np.array([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
+def glows(m: Medium) -> bool:
+    """Whether it emits anything."""
+    return bool(np.any(m.Le)) or m.columns.Le >= 0
 
 
 def dense(m: Medium) -> np.ndarray:
     """The (nx, ny, nz) float32 density samples of a grid medium, the truth to compare a reconstruction with."""
-    out = np.zeros([n * BRICK + 1 for n in m.bricks], np.float32)
-    side = (BRICK + 1,) * 3
-    bricks = np.lib.stride_tricks.sliding_window_view(out, side, writeable=True)[::BRICK, ::BRICK, ::BRICK]
-    bricks[m.offsets.reshape(m.bricks) >= 0] = m.samples.reshape(-1, *side)  # neighbours agree where they overlap
+    return dense_of(m, m.samples)[..., 0]
+
+
+def dense_of(m: Medium, samples: np.ndarray, first: int = 0, columns: int = 1) -> np.ndarray:
+    """(nx, ny, nz, columns) float32 of brick samples of a grid medium, from column ``first`` on; 0 where no brick is."""
+    width = len(samples) // max(len(m.samples), 1)
+    stored = samples.reshape(len(m.samples), max(width, columns))[:, first : first + columns]
+    out = np.zeros((*(n * BRICK + 1 for n in m.bricks), columns), np.float32)
+    side = (SIDE,) * 3
+    windows = np.lib.stride_tricks.sliding_window_view(out, side, axis=(0, 1, 2), writeable=True)  # type: ignore[call-overload]
+    windows = np.moveaxis(windows[::BRICK, ::BRICK, ::BRICK], 3, -1)
+    windows[m.offsets.reshape(m.bricks) >= 0] = stored.reshape(
+        -1, *side, columns
+    )  # neighbours agree where they overlap
     return out[: m.cells[0] + 1, : m.cells[1] + 1, : m.cells[2] + 1]
 
 
 @jit
 def interpolated(m, values, p):
     """Interpolate brick samples ``values`` at p, 0 outside the stored bricks."""
-    n = m.cells
-    u = (p[0] - m.lo[0]) / m.cell[0]
-    v = (p[1] - m.lo[1]) / m.cell[1]
-    w = (p[2] - m.lo[2]) / m.cell[2]
-    i = min(max(int(u), 0), n[0] - 1)
-    j = min(max(int(v), 0), n[1] - 1)
-    k = min(max(int(w), 0), n[2] - 1)
-    first = m.offsets[((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3)]
-    if first < 0:
-        return 0.0
-    a = first + ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
-    b = a + 81
-    corners = (values[a], values[a + 1], values[a + 9], values[a + 10])
-    others = (values[b], values[b + 1], values[b + 9], values[b + 10])
-    return trilinear(corners + others, u - i, v - j, w - k)
+    return mixed(values, 1, 0, cell_at(m, p))
 
 
 @jit
@@ -222,6 +258,8 @@ def density(m, p):
         return interpolated(m, m.samples, p)
     if m.kind == EXPONENTIAL:
         return math.exp(-(p[2] - m.base) * m.falloff)
+    if m.kind == FUNCTION:
+        return bounded(m, p)
     return 1.0
 
 
@@ -232,11 +270,37 @@ def attribute(m, p):
 
 
 @jit
+def phase_at(m, p):
+    """The phase function at a point: the medium's own, or with the g or S that a grid has there."""
+    c, f = m.columns, m.phase
+    if c.g >= 0:
+        g = mixed(m.fields, c.width, c.g, cell_at(m, p))
+        return phases.Phase(f.kind, g, f.g2, f.mix, f.S, f.own)
+    if c.S >= 0:
+        return phases.Phase(f.kind, f.g1, f.g2, f.mix, f.S, matrix(m, cell_at(m, p)))
+    return f
+
+
+@jit
+def albedo_at(m, p, a):
+    """RGB albedo at a point with attribute a."""
+    c = m.columns
+    return colour(m, c.albedo, c.albedo_step, cell_at(m, p)) if c.albedo >= 0 else lookup(m.albedo, a)
+
+
+@jit
+def Le_at(m, p, a):
+    """RGB emitted radiance at a point with attribute a."""
+    c = m.columns
+    return colour(m, c.Le, c.Le_step, cell_at(m, p)) if c.Le >= 0 else lookup(m.Le, a)
+
+
+@jit
 def extinction(m, p, d):
     """rho at p, times the projected area of microflakes towards d: sigma_t(x, d) / sigma_t."""
     rho = density(m, p)
     if m.phase.kind >= phases.SGGX_SPECULAR and rho > 0.0:
-        rho *= projected_area(phases.flakes_at(m.phase, attribute(m, p)), d)
+        rho *= projected_area(phases.flakes_at(phase_at(m, p), attribute(m, p)), d)
     return rho
 
 

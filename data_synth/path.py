@@ -19,7 +19,7 @@ from data_synth.cameras import pixel_ray
 from data_synth.jit import jit, kernel
 from data_synth.lights import POINT, column3, escaped, quad_pdf, quad_radiance, sample_light
 from data_synth.materials import DIELECTRIC
-from data_synth.media import attribute, box_interval, extinction, lookup
+from data_synth.media import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.parts import BLOCK
 from data_synth.rng import reseed, uniform
 from data_synth.traverse import collisions, traversal
@@ -82,9 +82,9 @@ def path_event(m, ray, t, width, state, rng):
     if largest(collide) <= 0.0:
         return state, False
     a = attribute(m, p)
-    albedo = lookup(m.albedo, a)
+    albedo = albedo_at(m, p, a)
     absorbed = mul(beta, mul(collide, sub((1.0, 1.0, 1.0), albedo)))
-    L = add(state.L, mul(absorbed, lookup(m.Le, a)))
+    L = add(state.L, mul(absorbed, Le_at(m, p, a)))
     base, far = state.base, state.far + mean(absorbed) * (state.base + t)
     scatter = mul(beta, mul(collide, albedo))
     fly = mul(beta, sub((1.0, 1.0, 1.0), collide))
@@ -108,7 +108,7 @@ def next_event(w, v, inside, beta, rng):
     mis = float(count)
     if v.material < 0:
         m = medium_of(w, v.number)
-        value = phase.evaluate(m.phase, attribute(m, v.p), v.wo, wi, rng)
+        value = phase.evaluate(phase_at(m, v.p), attribute(m, v.p), v.wo, wi, rng)
         f = (value, value, value)
         pdf_other = value if m.phase.kind != phase.SGGX_DIFFUSE else 0.0
         if w.lights[k, 0] == POINT:
@@ -213,7 +213,8 @@ def scatter_direction(w, v, rng):
     """(wi, weight, pdf, straight): a direction sampled by the phase function or surface at a vertex."""
     if v.material >= 0:
         return materials.sample(w.materials, v.material, v.p, v.n, v.wo, rng)
-    ph, a = medium_of(w, v.number).phase, attribute(medium_of(w, v.number), v.p)
+    m = medium_of(w, v.number)
+    ph, a = phase_at(m, v.p), attribute(m, v.p)
     wi = phase.sample(ph, a, v.wo, rng)
     known = ph.kind != phase.SGGX_DIFFUSE
     return wi, (1.0, 1.0, 1.0), phase.evaluate(ph, a, v.wo, wi, rng) if known else UNKNOWN, False

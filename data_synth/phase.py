@@ -19,13 +19,14 @@ from data_synth.rng import uniform
 from data_synth.vec import dot, neg, sphere_direction
 
 ISOTROPIC, RAYLEIGH, HG, SGGX_SPECULAR, SGGX_DIFFUSE = range(5)
+NO_OWN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Phase(NamedTuple):
     """A phase function. Make it with the functions below.
 
     g1, g2: mean cosines of the two Henyey-Greenstein lobes; mix: weight of the first. S: (K, 6) SGGX matrices, one per
-    value of the medium's attribute.
+    value of the medium's attribute. own: the matrix of the place instead, of media that have a grid (``media.phase_at``).
     """
 
     kind: int
@@ -33,6 +34,7 @@ class Phase(NamedTuple):
     g2: float
     mix: float
     S: np.ndarray
+    own: tuple[float, float, float, float, float, float] = NO_OWN
 
 
 _NO_FLAKES = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
@@ -73,7 +75,9 @@ def microflakes(*S: ArrayLike, diffuse: bool = False) -> Phase:
 
 @jit
 def flakes_at(phase, attribute):
-    """The six numbers of S for an attribute in [0, 1]: the nearest row."""
+    """The six numbers of S: of the place, else of the nearest row for an attribute in [0, 1]."""
+    if phase.own[0] > 0.0:
+        return phase.own
     n = phase.S.shape[0]
     k = min(max(int(attribute * (n - 1) + 0.5), 0), n - 1)
     S = phase.S

@@ -7,15 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from data_synth.fields import Columns
 from data_synth.jit import jit
 from data_synth.media import Medium
-from data_synth.phase import Phase
+from data_synth.phase import NO_OWN, Phase
 
-ARRAYS = ("offsets", "samples", "attributes", "brick_max", "brick_min", "albedo", "Le")
+ARRAYS = ("offsets", "samples", "attributes", "brick_max", "brick_min", "albedo", "Le", "fields", "faults")
 
 
 class Media(NamedTuple):
-    """numbers: (n, 32) the numbers of each medium; first: (n + 1, 8) where its arrays start in the arrays of all."""
+    """numbers: (n, 40) the numbers of each medium; first: (n + 1, 10) where its arrays start in the arrays of all."""
 
     numbers: np.ndarray
     first: np.ndarray
@@ -26,24 +27,24 @@ class Media(NamedTuple):
     brick_min: np.ndarray
     albedo: np.ndarray
     Le: np.ndarray
+    fields: np.ndarray
+    faults: np.ndarray
     S: np.ndarray
 
 
 def pool(media: Sequence[Medium]) -> Media:
     """Put the arrays of several media one behind the other."""
-    numbers, first = np.zeros((len(media), 32)), np.zeros((len(media) + 1, 8), np.int64)
+    numbers, first = np.zeros((len(media), 40)), np.zeros((len(media) + 1, 10), np.int64)
     for k, m in enumerate(media):
         row = [m.kind, *m.lo, *m.hi, *m.cells, *m.bricks, *m.cell, m.max_density, *m.sigma_t, m.base, m.falloff, m.step]
-        row += [m.flake_area, m.phase.kind, m.phase.g1, m.phase.g2, m.phase.mix]
+        row += [m.flake_area, m.phase.kind, m.phase.g1, m.phase.g2, m.phase.mix, *m.columns, m.function]
         numbers[k, : len(row)] = row
         first[k + 1] = first[k] + [*(len(getattr(m, name)) for name in ARRAYS), len(m.phase.S)]
     empty = [np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0), np.zeros(0)]
-    empty += [np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6))]
+    empty += [np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0), np.zeros((0, 6))]
     own = [[*(getattr(m, name) for name in ARRAYS), m.phase.S] for m in media]
-    offsets, samples, attributes, top, bottom, albedo, Le, S = (
-        np.concatenate(a) for a in zip(empty, *own, strict=True)
-    )
-    return Media(numbers, first, offsets, samples, attributes, top, bottom, albedo, Le, S)
+    arrays = [np.concatenate(a) for a in zip(empty, *own, strict=True)]
+    return Media(numbers, first, *arrays)
 
 
 @jit
@@ -70,5 +71,9 @@ def medium_at(media, k):
         n[21],
         n[22],
         n[23],
-        Phase(int(n[24]), n[25], n[26], n[27], media.S[a[7] : b[7]]),
+        Phase(int(n[24]), n[25], n[26], n[27], media.S[a[9] : b[9]], NO_OWN),
+        media.fields[a[7] : b[7]],
+        Columns(int(n[28]), int(n[29]), int(n[30]), int(n[31]), int(n[32]), int(n[33]), int(n[34])),
+        int(n[35]),
+        media.faults[a[8] : b[8]],
     )

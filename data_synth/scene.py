@@ -72,7 +72,7 @@ class Scene:
         if isinstance(self.medium, Channels) or any(isinstance(m, Channels) for m in self.media):
             raise TypeError("a scene in channels has three worlds")
         rows = lamps.discretise(self.lights, beams) if beams else list(self.lights)
-        glows = any(np.any(m.Le) for m in (self.medium, *self.media) if m is not None)
+        glows = any(media.glows(m) for m in (self.medium, *self.media) if isinstance(m, media.Medium))
         if not rows and not glows:
             warnings.warn(f"scene {self.name} has no lights: the picture is black", RenderWarning, stacklevel=3)
         shapes = surfaces.geometry(self.shapes, self.triangles)
@@ -117,6 +117,8 @@ class Scene:
         parts: list = [self.shapes, self.materials, self.layers, self.lights, self.triangles, self.medium, *self.media]
         while parts:
             part = parts.pop()
+            if isinstance(part, media.Medium):
+                part = part._replace(faults=())  # what rendering counts does not change the scene
             if isinstance(part, np.ndarray) and part.dtype != object:
                 digest.update(repr((part.shape, part.dtype.str)).encode())
                 digest.update(zlib.crc32(np.ascontiguousarray(part).data).to_bytes(4, "little"))

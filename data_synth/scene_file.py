@@ -56,16 +56,30 @@ class _Loader(yaml.SafeLoader):
 
 def volume(
     file: str, size: float = 2.0, centre: media.Point = (0.0, 0.0, 0.0), sigma_t: Any = 1.0, albedo: Any = 0.0,
-    Le: Any = 0.0, phase: Any = None,
+    Le: Any = 0.0, phase: Any = None, kelvin: float | None = None, heat: float = 1.0,
 ) -> media.Medium:  # fmt: skip
-    """A density volume, its largest sample scaled to 1, its longest side ``size``; sigma_t in 1/u."""
-    values, spacing = volumes.read_volume(file)
+    """A density volume, its largest sample scaled to 1, its longest side ``size``; sigma_t in 1/u. albedo is multiplied by the
+    colours (Cd) that the file holds; kelvin: its temperature or flame glows as in ``volumes.Volume.glow``, instead of Le."""
+    found = volumes.open_volume(file, uses=("colour",) if kelvin is None else ("colour", "heat"))
+    values, hot = found.density, found.heat
     if values.max() <= 0:
         raise InputError(f"{file}: expected a density that is somewhere positive, got at most {values.max():g}")
-    half = 0.5 * size * (np.array(values.shape) - 1) * spacing / ((np.array(values.shape) - 1) * spacing).max()
+    if kelvin is not None and hot is None:
+        raise InputError(f"{file}: expected a grid of temperature or flame for kelvin")
+    half = 0.5 * size * (np.array(values.shape) - 1) * found.spacing
+    half /= ((np.array(values.shape) - 1) * found.spacing).max()
     middle = surfaces.vector(centre, "centre")
-    density = np.maximum(values, 0) / values.max()
-    return media.grid(density, middle - half, middle + half, sigma_t, albedo, Le, phase)
+    largest = np.float32(values.max())
+
+    def scaled(v: np.ndarray) -> np.ndarray:
+        return np.maximum(v, 0) / largest
+
+    density = scaled(values) if isinstance(values, np.ndarray) else values.map(scaled)
+    if found.colour is not None:
+        tint = np.array(media.rgb(albedo, "albedo", 1.0), np.float32)
+        albedo = found.colour.map(lambda v: v * tint)
+    Le = Le if kelvin is None else found.glow(kelvin, heat)
+    return media.grid(density, middle - half, middle + half, sigma_t, albedo, Le, phase, attribute=hot)
 
 
 def cloud(

@@ -17,7 +17,7 @@ import numpy as np
 
 from data_synth import lights as lamps
 from data_synth.errors import InputError
-from data_synth.jit import in_bands, jit, kernel
+from data_synth.jit import in_bands, jit, kernel, plain
 from data_synth.lights import DIRECTIONAL, sample_light
 from data_synth.rng import new_rng
 from data_synth.vec import frame, trilinear
@@ -77,7 +77,7 @@ def _frame(w: World, k: int, resolution: int, turned: bool) -> tuple[np.ndarray,
     axes = np.eye(3)
     if turned and w.lights[k, 0] == DIRECTIONAL:
         d = tuple(w.lights[k, 7:10])
-        axes = np.array([*frame.py_func(d), d])
+        axes = np.array([*plain(frame)(d), d])
     corners = np.array([[(lo, hi)[b >> a & 1][a] for a in range(3)] for b in range(8)]) @ axes.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     spacing = (high - low).max() / (resolution - 1)

@@ -21,6 +21,7 @@ import numpy as np
 from data_synth import lights, phase
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
+from data_synth.media import Medium
 from data_synth.scene import Scene
 
 HELD = 5
@@ -40,6 +41,8 @@ def suns_of(scene: object, n: int) -> list[Sun]:
     suns and white, spread over the sphere along Fibonacci's spiral; the held-out ones lie between the others."""
     if not isinstance(scene, Scene) or scene.medium is None:
         raise InputError("--suns: expected a scene with a medium, whose light can be chosen")
+    if isinstance(scene.medium, Medium) and scene.medium.columns.g >= 0:
+        raise InputError("--suns: expected one phase function for the whole medium, its g is a grid")
     phase_lobes(scene.medium.phase)
     own = [row for row in scene.lights if row[0] == lights.DIRECTIONAL]
     if not own:

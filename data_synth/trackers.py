@@ -17,7 +17,8 @@ from __future__ import annotations
 import math
 
 from data_synth.jit import jit
-from data_synth.media import GRID, HOMOGENEOUS, box_interval, extinction
+from data_synth.media import EXPONENTIAL, HOMOGENEOUS, box_interval, extinction
+from data_synth.phase import SGGX_SPECULAR
 from data_synth.rng import uniform
 from data_synth.traverse import cells, chord_thickness, collisions, steps, traversal
 from data_synth.vec import along, exp_neg, largest, mul, scale, sub
@@ -82,7 +83,7 @@ def residual_collisions(m, ray, a, b, brick, carry, state, rng):
         low, high = 0.0, m.max_density
     else:
         low, high = m.brick_min[brick], m.brick_max[brick]
-    if m.flake_area != 1.0:  # directional extinction: no lower bound is kept
+    if m.phase.kind >= SGGX_SPECULAR:  # directional extinction: no lower bound is kept
         low = 0.0
     control = exp_neg(scale(low * (b - a), m.sigma_t))
     state = (state[0] * control[0], state[1] * control[1], state[2] * control[2], low)
@@ -133,12 +134,13 @@ def transmittance(m, ray, t0, t1, method, local, rng):
 
 @jit
 def shadow_transmittance(m, ray, t_max, random, rng):
-    """What shadow rays use: the closed form where there is one, else ratio tracking with roulette, or marching."""
+    """What shadow rays use: the closed form where there is one, of flakes too, which are alike everywhere there; else ratio
+    tracking with roulette, or marching."""
     t0, t1 = box_interval(ray, m.lo, m.hi)
     t1 = min(t1, t_max)
     if t1 <= t0:
         return (1.0, 1.0, 1.0)
-    if m.kind != GRID and m.flake_area == 1.0:
+    if m.kind == HOMOGENEOUS or m.kind == EXPONENTIAL:
         return exp_neg(scale(chord_thickness(m, ray, 0.5 * (t0 + t1), t1 - t0), m.sigma_t))
     if random:
         s, _ = shadow_tracking(m, ray, t0, t1, True, (1.0, 1.0, 1.0, 0.0), rng)

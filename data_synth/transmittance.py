@@ -8,8 +8,9 @@ import numpy as np
 
 from data_synth.channels import Channels
 from data_synth.errors import InputError
+from data_synth.functions import say_faults
 from data_synth.jit import kernel
-from data_synth.media import EXPONENTIAL, HOMOGENEOUS, Medium, Point, triple
+from data_synth.media import EXPONENTIAL, FUNCTION, HOMOGENEOUS, Medium, Point, triple
 from data_synth.rng import new_rng
 from data_synth.trackers import CLOSED, DELTA, MARCH, RATIO, REGULAR, RESIDUAL, free_flight, transmittance
 
@@ -50,6 +51,7 @@ def sample_transmittance(
         )
     out = np.empty((n, 3))
     _transmittances(m, _ray(o, d), float(t1), _method(m, method, METHODS), bool(local), new_rng(seed, 0), out)
+    say_faults(m.faults)
     return out
 
 
@@ -66,6 +68,7 @@ def sample_flights(
     """(n,) independent free-flight distances from o along unit d, inf for those that leave or reach t1."""
     out = np.empty(n)
     _flights(m, _ray(o, d), float(t1), _method(m, method, DISTANCE_METHODS), bool(local), new_rng(seed, 0), out)
+    say_faults(m.faults)
     return out
 
 
@@ -80,4 +83,8 @@ def _method(m: Medium, name: str, methods: dict) -> int:
         raise InputError(f"method: expected one of {', '.join(methods)}, got '{name}'")
     if name == "closed" and (m.kind not in (HOMOGENEOUS, EXPONENTIAL) or methods is DISTANCE_METHODS and m.kind):
         raise InputError("method: this medium has no closed form, expected another method than 'closed'")
+    if name == "regular" and m.kind == FUNCTION:
+        raise InputError(
+            "method: regular tracking is exact cell by cell and a density function has none, expected another"
+        )
     return methods[name]

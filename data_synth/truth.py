@@ -2,14 +2,21 @@
 
 | array                                   | content                                                                     |
 |-----------------------------------------|-----------------------------------------------------------------------------|
-| ``mediumK_kind``                        | homogeneous, grid or exponential; K = 0, 1, ... as boundaries number them    |
+| ``mediumK_kind``                        | homogeneous, grid, exponential, function or rgb_grid; K = 0, 1, ... as       |
+|                                         | boundaries number them                                                      |
 | ``mediumK_lo``, ``_hi``                 | its box                                                                     |
 | ``mediumK_sigma_t``                     | (3,) extinction per density in 1/u                                          |
 | ``mediumK_density``, ``_attribute``     | samples at the vertices of a grid from lo to hi; the attribute only if any  |
 | ... of kind rgb_grid                    | density and albedo are (nx, ny, nz, 3): extinction in 1/u, and albedo       |
+| ... above 2^28 samples                  | no dense arrays: ``_cells``, ``_offsets`` (first sample of each brick of 8^3 |
+|                                         | cells, -1: empty), ``_samples``, ``_attributes``, ``_fields``, ``_columns`` |
 | ``mediumK_height``                      | exponential: density exp(-(z - lo_z) / height)                              |
-| ``mediumK_albedo``, ``_Le``             | (n, 3) tables over the attribute in [0, 1], linear in between               |
+| ... function                            | ``_function``: its name, ``_source``: its text; ``_density``: samples of it,|
+|                                         | 64 cells along the longest side; ``_majorant``: (bx, by, bz)                |
+| ``mediumK_albedo``, ``_Le``             | (n, 3) tables over the attribute in [0, 1], linear in between; or grids,    |
+|                                         | (nx, ny, nz, 1 or 3), trilinear as the density                              |
 | ``mediumK_phase``, ``_g``, ``_S``       | its name; g1, g2 and the weight of the first lobe; (n, 6) SGGX matrices     |
+| ``mediumK_g_grid``, ``_S_grid``         | (nx, ny, nz) in place of g1, (nx, ny, nz, 6) in place of S, where they vary |
 | ``number``, ``number_lo``, ``number_hi``| medium at each vertex of a grid, -1 for none; media are cut by boundaries   |
 | ``shapes``, ``triangles``, ``materials``| tables as ``surfaces`` and ``materials`` describe them                      |
 | ``layers``, ``lights``                  | tables as ``spongecake`` and ``lights`` describe them                       |
@@ -26,12 +33,16 @@ from data_synth import materials as stuff
 from data_synth import media, surfaces
 from data_synth.channels import Channels
 from data_synth.files import replacing
+from data_synth.functions import COMPILED
+from data_synth.volumes import is_large
 
 if TYPE_CHECKING:
     from data_synth.scene import Scene
 
 RESOLUTION = 64  # cells along the longest side of ``number``
-KINDS = {media.HOMOGENEOUS: "homogeneous", media.GRID: "grid", media.EXPONENTIAL: "exponential"}
+KINDS = {
+    media.HOMOGENEOUS: "homogeneous", media.GRID: "grid", media.EXPONENTIAL: "exponential", media.FUNCTION: "function",
+}  # fmt: skip
 PHASES = ("isotropic", "rayleigh", "henyey_greenstein", "sggx_specular", "sggx_diffuse")
 
 
@@ -56,7 +67,10 @@ def write(scene: Scene, path: Path) -> None:
 def _channels(m: Channels) -> dict[str, object]:
     grids = {"density": m, "albedo": [one._replace(samples=one.attributes) for one in m]}
     own = {name: np.stack([media.dense(one) for one in media_], -1) for name, media_ in grids.items()}
-    return _medium(m.red) | own | {"kind": "rgb_grid", "Le": m.Le, "attribute": np.zeros(0)}
+    glow = m.Le
+    if m.red.columns.Le >= 0:
+        glow = np.concatenate([media.dense_of(one, one.fields, one.columns.Le) for one in m], axis=-1)
+    return _medium(m.red) | own | {"kind": "rgb_grid", "Le": glow, "attribute": np.zeros(0)}
 
 
 def _medium(m: media.Medium) -> dict[str, object]:
@@ -65,11 +79,63 @@ def _medium(m: media.Medium) -> dict[str, object]:
         "phase": PHASES[m.phase.kind], "g": (m.phase.g1, m.phase.g2, m.phase.mix), "S": m.phase.S,
     }  # fmt: skip
     if m.kind == media.GRID:
+        if is_large(m):
+            return out | _in_bricks(m)
         out["density"] = media.dense(m)
         if m.attributes.size > 1:
             out["attribute"] = media.dense(m._replace(samples=m.attributes))
+        out |= _fields(m)
+    if m.kind == media.FUNCTION:
+        out |= _function(m)
     if m.kind == media.EXPONENTIAL:
         out["height"] = 1.0 / m.falloff
+    return out
+
+
+def _in_bricks(m: media.Medium) -> dict[str, object]:
+    return {"cells": m.cells, "offsets": m.offsets, "samples": m.samples, "attributes": m.attributes,
+            "fields": m.fields, "columns": m.columns}  # fmt: skip
+
+
+def _fields(m: media.Medium) -> dict[str, object]:
+    """The grids of what varies."""
+    c, out = m.columns, {}
+    for name, first, columns in (
+        ("albedo", c.albedo, 1 + 2 * c.albedo_step), ("Le", c.Le, 1 + 2 * c.Le_step), ("g_grid", c.g, 1), ("S_grid", c.S, 6),
+    ):  # fmt: skip
+        if first >= 0:
+            grid = media.dense_of(m, m.fields, first, columns)
+            out[name] = grid[..., 0] if name == "g_grid" else grid
+    return out
+
+
+def _function(m: media.Medium) -> dict[str, object]:
+    known, box = COMPILED[m.function], np.array(m.hi) - m.lo
+    cells = np.maximum(np.rint(box / box.max() * RESOLUTION).astype(int), 1)
+    axes = [np.linspace(a, b, n + 1) for a, b, n in zip(m.lo, m.hi, cells, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    density = np.array([known.call(*p) for p in points], np.float32).reshape(cells + 1)
+    return {
+        "function": known.name, "source": known.source, "density": density, "majorant": m.brick_max.reshape(m.bricks),
+    }  # fmt: skip
+
+
+def described(scene: Scene) -> dict[str, dict[str, object]]:
+    """What truth.npz tells of each medium, in words: its kind, and of each array whether it is a grid, and of which shape."""
+    out: dict[str, dict[str, object]] = {}
+    for k, m in enumerate((scene.medium, *scene.media)):
+        if m is None:
+            continue
+        one = m.red if isinstance(m, Channels) else m
+        grid, c = [n + 1 for n in one.cells], one.columns
+        told: dict[str, object] = {"kind": "rgb_grid" if isinstance(m, Channels) else KINDS[one.kind]}
+        if one.kind == media.GRID:
+            told["density"] = [*grid, 3] if isinstance(m, Channels) else grid
+        varied = {"albedo": c.albedo >= 0 or isinstance(m, Channels), "Le": c.Le >= 0, "g": c.g >= 0, "S": c.S >= 0}
+        told |= {name: "grid" for name, is_grid in varied.items() if is_grid}
+        if one.kind == media.FUNCTION:
+            told["density"] = f"the function {COMPILED[one.function].name}"
+        out[f"medium{k}"] = told
     return out
 
 

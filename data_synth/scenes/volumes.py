@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 
 from data_synth import blackbody, clouds, lights, materials, media, phase, surfaces
+from data_synth.bricks import Sparse
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError, RenderWarning
 from data_synth.jit import in_bands
 from data_synth.noise import cloud_textures
 from data_synth.scene import Scene
 from data_synth.scenes.procedural import fill_fireball, fill_plume
-from data_synth.volumes import read_volume
+from data_synth.volumes import Volume, open_volume, read_volume
 
 CLOUD_PHASE = phase.two_lobes(0.6, -0.25, 0.6)
 EVENING_SUN = lights.directional((1.0, 0.35, 0.42), (34.0, 19.0, 9.5))
@@ -30,7 +33,7 @@ def cloud(
     if volume is None:
         rho = clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed)
     else:
-        rho, lo, hi = _imported(volume, lo, hi)
+        rho, lo, hi = _scaled(volume, open_volume(volume, uses=()), lo, hi)
     medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,
@@ -88,14 +91,17 @@ def stratus(coverage: float = 0.60, density: float = 18.0, resolution: int = 160
 def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: str | None = None) -> Scene:
     """a smoke plume over a floor that shows its shadow; takes any volume: --volume smoke.vdb"""
     lo, hi = (-0.8, -0.8, -1.1), (0.8, 0.8, 1.3)
+    albedo: Any = (0.92, 0.90, 0.88)
     if volume is None:
         n = resolution
         rho = np.empty((int(n * 2 / 3), int(n * 2 / 3), n), np.float32)
         detail = cloud_textures(seed, 64).base
         in_bands(lambda a, b: fill_plume(detail, rho, a, b), rho.shape[0], 4)
     else:
-        rho, lo, hi = _imported(volume, lo, hi, up="y")
-    medium = media.grid(rho, lo, hi, density, (0.92, 0.90, 0.88), phase=phase.henyey_greenstein(0.3))
+        found = open_volume(volume, uses=("colour",)).upright()
+        rho, lo, hi = _scaled(volume, found, lo, hi)
+        albedo = albedo if found.colour is None else found.colour.map(lambda v: v * np.float32(albedo))
+    medium = media.grid(rho, lo, hi, density, albedo, phase=phase.henyey_greenstein(0.3))
     return Scene(
         medium=medium,
         shapes=[surfaces.box(0, (-1.5, -1.5, -1.25), (1.5, 1.5, -1.15))],
@@ -109,15 +115,24 @@ def smoke(density: float = 9.0, resolution: int = 128, seed: int = 2, volume: st
 
 
 def explosion(
-    density: float = 16.0, heat: float = 8.0, kelvin: float = 2600.0, resolution: int = 128, seed: int = 4
+    density: float = 16.0, heat: float = 8.0, kelvin: float = 2600.0, resolution: int = 128, seed: int = 4,
+    volume: str | None = None,
 ) -> Scene:  # fmt: skip
-    """a fireball: soot that glows as a black body, hottest in its cracks"""
-    n = resolution
-    rho, hot = np.empty((n, n, n), np.float32), np.empty((n, n, n), np.float32)
-    t = cloud_textures(seed, 64).base
-    in_bands(lambda a, b: fill_fireball(t, rho, hot, a, b), n, 4)
-    glow = heat * blackbody.glow(kelvin * np.linspace(0.6, 1.0, 64), kelvin)
-    medium = media.grid(rho, (-1.2,) * 3, (1.2,) * 3, density, 0.35, glow, attribute=hot)
+    """a fireball: soot that glows as a black body, hottest in its cracks; a --volume may bring temperature, flame and Cd"""
+    n, lo, hi, albedo = resolution, (-1.2,) * 3, (1.2,) * 3, cast(Any, 0.35)
+    if volume is None:
+        rho, hot = np.empty((n, n, n), np.float32), np.empty((n, n, n), np.float32)
+        t = cloud_textures(seed, 64).base
+        in_bands(lambda a, b: fill_fireball(t, rho, hot, a, b), n, 4)
+        glow = heat * blackbody.glow(kelvin * np.linspace(0.6, 1.0, 64), kelvin)
+    else:
+        found = open_volume(volume).upright()
+        rho, lo, hi = _scaled(volume, found, lo, hi)
+        albedo, hot = 0.35 if found.colour is None else found.colour.map(lambda v: np.float32(0.35) * v), found.heat
+        if hot is None:
+            raise InputError(f"{volume}: expected a grid of temperature or flame beside the density")
+        glow = found.glow(kelvin, heat)
+    medium = media.grid(rho, lo, hi, density, albedo, glow, attribute=hot)
     return Scene(
         medium=medium,
         lights=[lights.directional((0.7, -0.4, 1.0), (2.2, 2.2, 2.4)), lights.sky((0.3, 0.4, 0.6), 0.35, 0.15)],
@@ -218,13 +233,42 @@ def _head(n: int) -> np.ndarray:
     return np.clip(value * cut, 0, 1)
 
 
+def _scaled(
+    path: str, volume: Volume, lo: media.Point, hi: media.Point
+) -> tuple[np.ndarray | Sparse, media.Point, media.Point]:
+    """The density in [0, 1], 1 where it is largest, in a box as large as lo..hi allows."""
+    samples = volume.density
+    largest, smallest = float(samples.max()), float(samples.min())
+    if largest <= 0:
+        raise InputError(f"{path}: expected a density that is somewhere positive, got at most {largest:g}")
+    if smallest < 0:
+        warnings.warn(
+            f"{path}: some samples are negative, down to {smallest:g}, and count as 0", RenderWarning, stacklevel=3
+        )
+
+    def clipped(v: np.ndarray) -> np.ndarray:
+        return np.clip(v / np.float32(largest), 0.0, 1.0)
+
+    box = _placed(samples.shape, volume.spacing, lo, hi)
+    return samples.map(clipped) if isinstance(samples, Sparse) else clipped(samples), *box
+
+
+def _placed(
+    shape: Sequence[int], spacing: np.ndarray, lo: media.Point, hi: media.Point
+) -> tuple[media.Point, media.Point]:
+    """The box of a volume in the middle of lo..hi, as large as fits."""
+    extent = (np.array(shape) - 1) * spacing
+    room = np.array(hi) - np.array(lo)
+    extent *= (room / extent).min()
+    middle = 0.5 * (np.array(hi) + np.array(lo))
+    return tuple(middle - extent / 2), tuple(middle + extent / 2)
+
+
 def _imported(
-    volume: str, lo: media.Point, hi: media.Point, up: str = "z", values: tuple[float, float] | None = None
+    volume: str, lo: media.Point, hi: media.Point, values: tuple[float, float] | None = None
 ) -> tuple[np.ndarray, media.Point, media.Point]:
     """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows. values: what becomes 0 and 1."""
     samples, spacing = read_volume(volume)
-    if up == "y":  # right-handed: x, y, z -> x, -z, y
-        samples, spacing = samples[:, :, ::-1].transpose(0, 2, 1), spacing[[0, 2, 1]]
     low, high = values or (0.0, float(samples.max()))
     if high <= low:
         raise InputError(f"{volume}: expected a density that is somewhere positive, got at most {high:g}")
@@ -232,8 +276,4 @@ def _imported(
         share = float((samples < 0).mean())
         warnings.warn(f"{volume}: {share:.1%} of the samples are negative and count as 0", RenderWarning, stacklevel=3)
     samples = np.clip((samples - low) / (high - low), 0.0, 1.0)
-    extent = (np.array(samples.shape) - 1) * spacing
-    room = np.array(hi) - np.array(lo)
-    extent *= (room / extent).min()
-    middle = 0.5 * (np.array(hi) + np.array(lo))
-    return np.ascontiguousarray(samples, np.float32), tuple(middle - extent / 2), tuple(middle + extent / 2)
+    return np.ascontiguousarray(samples, np.float32), *_placed(samples.shape, spacing, lo, hi)

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-COMMAND = "-m pytest -q -x -n 0 -p no:cacheprovider tests/data_synth/plain_paths.py"
+COMMAND = "-m pytest -q -x -n 0 -p no:cacheprovider tests/data_synth/plain_paths.py tests/data_synth/plain_fields.py"
 
 
 def test_paths_in_plain_python():

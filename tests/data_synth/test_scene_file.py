@@ -140,5 +140,7 @@ def test_kinds_are_all_functions_that_make_rows():
             if callable(f) and getattr(f, "__module__", "") == module.__name__ and not name.startswith("_")
             and f.__annotations__.get("return") in ("np.ndarray", "Medium", "Phase")
         }  # fmt: skip
-        assert made - {"geometry", "dense", "from_function"} <= set(scene_file.KINDS[what]), what
+        assert made - {"geometry", "dense", "dense_of", "from_function", "procedural"} <= set(scene_file.KINDS[what]), (
+            what
+        )
     assert yaml.safe_load(EVERYTHING)

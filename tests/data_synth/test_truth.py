@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_synth import media, scene_file, scenes
+from data_synth import Options, channels, media, scene_file, scenes, truth
+from data_synth.dataset import _provenance
 from data_synth.scene import Scene
 from data_synth.scenes.showcase import Showcase
 
@@ -67,3 +68,46 @@ def test_boundaries_say_which_medium_is_where(tmp_path):
     assert np.array_equal(truth["number"][clear_cut], want[clear_cut]) and set(np.unique(want)) == {-1, 0, 1}
     assert truth["medium0_kind"] == "exponential" and truth["medium0_height"] == pytest.approx(0.5)
     assert truth["medium1_sigma_t"].tolist() == [6.0, 3.0, 0.8] and truth["medium0_phase"] == "henyey_greenstein"
+
+
+def fog(x, y, z):
+    return 0.5 + 0.25 * x
+
+
+def test_grids_are_written_and_said(tmp_path):
+    """Every grid comes back at its vertices, of one density and of channels; the description names each of them."""
+    rng = np.random.default_rng(0)
+    n = (4, 11, 9)
+    given = {"albedo": rng.random((*n, 3)), "Le": rng.random((*n, 3)), "g": rng.uniform(-0.9, 0.9, n)}
+    S = np.tile([1.0, 0.5, 0.25, 0.1, 0, 0], (*n, 1)) * rng.uniform(0.5, 1, (*n, 1))
+    density, sigma = 0.1 + rng.random(n), 0.1 + rng.random((*n, 3))
+    scene = Scene(
+        medium=channels.rgb_grid(sigma, (0,) * 3, (1, 2, 3), **given),
+        media=[
+            media.grid(density, (0,) * 3, (1, 2, 3), **given),
+            media.grid(density, (0,) * 3, (1, 2, 3), Le=density, S=S),
+            media.procedural(fog, (0,) * 3, (1, 2, 3), np.ones((1, 2, 3))),
+        ],
+    )
+    truth_of = written(scene, tmp_path)
+    for k, density_of in ((0, sigma), (1, density)):
+        for name, want in (
+            ("density", density_of),
+            ("albedo", given["albedo"]),
+            ("Le", given["Le"]),
+            ("g_grid", given["g"]),
+        ):
+            assert np.allclose(truth_of[f"medium{k}_{name}"], want, atol=1e-6), (k, name)
+    assert np.allclose(truth_of["medium2_Le"][..., 0], density) and np.allclose(
+        truth_of["medium2_S_grid"], S, atol=1e-6
+    )
+    assert "return 0.5 + 0.25 * x" in str(truth_of["medium3_source"]) and str(truth_of["medium3_function"]) == "fog"
+    assert np.allclose(truth_of["medium3_density"][:, 0, 0], 0.5 + 0.25 * np.linspace(0, 1, 22))
+    assert truth_of["medium3_majorant"].shape == (1, 2, 3)
+    assert truth.described(scene) == {
+        "medium0": {"kind": "rgb_grid", "density": [*n, 3], "albedo": "grid", "Le": "grid", "g": "grid"},
+        "medium1": {"kind": "grid", "density": [*n], "albedo": "grid", "Le": "grid", "g": "grid"},
+        "medium2": {"kind": "grid", "density": [*n], "Le": "grid", "S": "grid"},
+        "medium3": {"kind": "function", "density": "the function fog"},
+    }
+    assert _provenance(scene, Options())["truth"] == truth.described(scene)

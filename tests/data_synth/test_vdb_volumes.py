@@ -9,7 +9,7 @@ import pytest
 from data_synth import media, scenes
 from data_synth.blosc import decompress
 from data_synth.errors import InputError, RenderWarning
-from data_synth.vdb import _Reader, _Tree, read_vdb
+from data_synth.vdb import Reader, Tree, read_vdb
 from data_synth.vdb_write import SparseGrid, write_grids, write_vdb
 from data_synth.volumes import read_volume, write_density
 from tests.fixtures.real import real_data
@@ -127,8 +127,8 @@ def test_random_damage_never_escapes(tmp_path, values):
 def test_inactive_values_of_a_compressed_leaf(code, extra, inactive):
     """The six ways in which OpenVDB leaves out inactive values; voxels 1 and 3 are chosen, voxel 2 is active."""
     data = bytes([code]) + extra + struct.pack("<f", 9.0)
-    tree = _Tree.__new__(_Tree)
-    tree.r, tree.flags, tree.half, tree.background = _Reader(data, "x.vdb"), 2, False, 0.5
+    tree = Tree.__new__(Tree)
+    tree.r, tree.flags, tree.half, tree.background = Reader(data, "x.vdb"), 2, False, 0.5
     active = np.zeros(512, bool)
     active[2] = True
     values, _ = tree._values(512, active)
