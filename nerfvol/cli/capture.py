@@ -16,24 +16,27 @@ from typing import TYPE_CHECKING, Annotated, Any
 from nerfvol.cli.command import Command, need, set_threads
 from nerfvol.cli.photographs import SCENE
 from nerfvol.config.values import Count, Seconds, at_least, within
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 
 if TYPE_CHECKING:
     from nerfvol.training.train import Results
 
 VIDEO, PAGE = "video.mp4", "scene.html"
 FILM_VIEWS, FILM_SIDE = 150, 960
+TIME_BUDGET = 120.0
+"""Seconds of training where nobody says."""
 SECONDS_A_PHOTOGRAPH, SECONDS_AT_THE_END = 0.4, 15.0
 """What a bar expects before it knows."""
 
 
 @dataclass
 class CaptureOptions:
-    """``nerfvol capture``. ``time_budget``: of the training alone."""
+    """``nerfvol capture``. ``time_budget``: of the training alone; None: what the folder's run was begun with, else
+    :data:`TIME_BUDGET`."""
 
     source: str = ""
     out: str = ""
-    time_budget: Seconds = 120.0
+    time_budget: Seconds | None = None
     frames: Annotated[int, within(3, 2000)] = 120
     size: Annotated[int, within(200, 8000)] = 1000
     fisheye: bool = False
@@ -48,7 +51,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", metavar="RUN", help="run folder: scene/ (pictures and cameras), the model, photographs.csv, "
                    "video.mp4")  # fmt: skip
     p.add_argument("--config", metavar="FILE", help="YAML file of this command's options")
-    p.add_argument("--time-budget", metavar="TIME", help="for the training (default: 2m)")
+    p.add_argument("--time-budget", metavar="TIME", help="for the training (default: 2m; of a run that goes on: what it was "
+                   "begun with)")  # fmt: skip
     p.add_argument("--frames", metavar="N", help="most frames that are taken of a video (default: 120)")
     p.add_argument("--size", metavar="PIXELS", help="longest side of the pictures that are trained on (default: 1000)")
     p.add_argument("--fisheye", action="store_true", help="the lens is a fisheye (OpenCV's model)")
@@ -126,7 +130,7 @@ def run(options: CaptureOptions) -> int:
     started = time.perf_counter()
     set_threads(options.threads)
     out = Path(options.out)
-    bar = Bar({"cameras": options.frames * SECONDS_A_PHOTOGRAPH, "training": options.time_budget,
+    bar = Bar({"cameras": options.frames * SECONDS_A_PHOTOGRAPH, "training": options.time_budget or TIME_BUDGET,
                "film": SECONDS_AT_THE_END})  # fmt: skip
     find_cameras(options, out / SCENE, bar)
     train_model(options, out, bar)
@@ -151,25 +155,27 @@ def find_cameras(options: CaptureOptions, scene: Path, bar: Bar) -> None:
 def train_model(options: CaptureOptions, out: Path, bar: Bar) -> None:
     """The model in ``out``: trained, trained on from a checkpoint, or there already."""
     from nerfvol.cli.train import print_results
-    from nerfvol.config.assemble import assemble
+    from nerfvol.config.assemble import assemble, read_yaml
     from nerfvol.config.training import Config
+    from nerfvol.files.run_folder import CONFIG, PREVIOUS
     from nerfvol.training.train import train
 
-    layers: list[tuple[dict[str, Any], str]] = []
+    asked: dict[str, Any] = {} if options.time_budget is None else {"time_budget": options.time_budget}
     going_on = training_state(out, out / SCENE)
+    saved = read_yaml(out / CONFIG) if going_on != "none" else {}
     if going_on == "finished":
-        bar.say(f"the model is there already: {out}")
-        return
+        before = saved.get("time_budget")
+        if asked.get("time_budget", before) == before:
+            bar.say(f"the model is there already: {out}")
+            return
+        bar.say(f"the model that is there had a time budget of {shown(before)} s: it goes to {out / PREVIOUS}, and another "
+                "is trained")  # fmt: skip
     if going_on == "begun":
-        from nerfvol.config.assemble import read_yaml
-        from nerfvol.files.run_folder import CONFIG
-
-        layers.append((read_yaml(out / CONFIG), str(out / CONFIG)))
-        layers.append(({"resume": True}, "capture"))
+        layers = [(saved, str(out / CONFIG)), ({"resume": True, **asked}, "capture")]
     else:
-        settings = {"data": str(out / SCENE), "out": str(out), "time_budget": options.time_budget, "seed": options.seed,
+        settings = {"data": str(out / SCENE), "out": str(out), "time_budget": TIME_BUDGET, "seed": options.seed,
                     "threads": options.threads}  # fmt: skip
-        layers.append((settings, "capture"))
+        layers = [(settings, "capture"), (asked, "capture")]
     results: Results | None = train(
         assemble(Config, *layers), time.perf_counter(), bar.say, lambda name, done: TrainingBar(bar, done)
     )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from nerfvol.cameras.camera import FARTHEST, rigid_pose
 from nerfvol.cameras.lens import BrownConrady
 from nerfvol.datasets.colmap_files import (
+    PointRecord,
     count_images,
     images_file,
     points_file,
@@ -32,6 +33,7 @@ from nerfvol.errors import InputError
 _PLACES = ("sparse", "colmap/sparse", "distorted/sparse", ".")
 _MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
 _AROUND = 1.25  # a lens's distortion may move a point by so much from where a pinhole would show it
+_LARGE_ERROR = 2.0  # pixels: the middle reprojection error of a model's points is 0.4 to 1.2 where poses are good
 _FITTING = (
     0.9  # of the observations, the fewest that lie inside their images; all do where poses and points belong together
 )
@@ -165,11 +167,25 @@ def model_points(path: Path) -> ModelPoints:
 
 
 def _doubt(path: Path, frames: dict[int, Frame]) -> list[str]:
-    """A sentence where the model's points lie outside the images that it says show them; ``frames`` by image number."""
+    """Sentences where the model's points lie outside the images that it says show them, or beside what these show;
+    ``frames`` by image number."""
+    points = list(itertools.islice(read_points(path), _MOST_POINTS))
+    errors = [point.error for point in points if point.error > 0]  # COLMAP writes -1 where it has not computed any
+    doubts = []
+    if errors and (middle := float(np.median(errors))) > _LARGE_ERROR:
+        doubts = [
+            f"{path}: half of its points are {middle:.1f} pixels or more from where the photographs show them, where 1 is "
+            "usual: the poses fit badly, so expect blur; find them anew (nerfvol poses), or try --refine-poses"
+        ]
+    return doubts + _outside(path, points, frames)
+
+
+def _outside(path: Path, points: Sequence[PointRecord], frames: dict[int, Frame]) -> list[str]:
+    """A sentence where the points lie outside the images that the model says show them."""
     if any(not isinstance(frame.calibration.lens, BrownConrady) for frame in frames.values()):
         return []
     shown: dict[int, list[tuple[float, ...]]] = {}
-    for point in itertools.islice(read_points(path), _MOST_POINTS):
+    for point in points:
         for number in point.track:
             shown.setdefault(number, []).append(point[:3])
     inside = total = 0

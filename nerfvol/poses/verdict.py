@@ -16,6 +16,8 @@ TURNING = 0.003
 """Of a picture's longer side: parallax below which the camera turned on the spot (matches are good to half of that)."""
 LARGE_ERROR = 1.5
 NAMED = 5
+LEAST_GROUP = 3
+"""Photographs of which cameras could follow."""
 
 
 def components(names: Sequence[str], links: Sequence[tuple[str, str, int]], least: int = 15) -> list[list[str]]:
@@ -43,6 +45,21 @@ def listed(names: Sequence[str]) -> str:
     return shown + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
+def groups_of(result: dict[str, Any], names: Sequence[str]) -> list[list[str]]:
+    """The groups of two or more photographs that hang together, the largest first."""
+    return [group for group in components(names, result["links"]) if len(group) > 1]
+
+
+def parted(groups: Sequence[Sequence[str]], n: int) -> str:
+    """What the two largest of several groups are; ``n`` photographs in all."""
+    first, second = groups[:2]
+    more = f"; {sum(map(len, groups[2:]))} are in smaller groups" if len(groups) > 2 else ""
+    return (
+        f"{len(first)} of {n} photographs hang together ({listed(first)}); {len(second)} more form a group without connection "
+        f"to it ({listed(second)}){more}"
+    )
+
+
 def turning(result: dict[str, Any]) -> bool:
     """Whether the camera turned without moving: one rotation a pair explains its matches."""
     motion = result["motion"]
@@ -65,7 +82,7 @@ def failure(result: dict[str, Any], names: Sequence[str], sharpness: float | Non
         )
     if enough:
         return None
-    groups = [group for group in components(names, result["links"]) if len(group) > 1]
+    groups = groups_of(result, names)
     if features < FEW_FEATURES:
         why = "they are blurred" if sharpness is not None and 0 < sharpness < BLURRED else "blur or bare walls"
         return (
@@ -74,12 +91,8 @@ def failure(result: dict[str, Any], names: Sequence[str], sharpness: float | Non
         )
     if not groups:
         return f"no two of the {n} photographs share enough ({features:,} features each): each must show half of the one before"
-    if len(groups) > 1 and len(groups[1]) >= 3:
-        small = groups[1]
-        return (
-            f"{len(groups[0])} of {n} photographs hang together; {len(small)} more form a group without connection to it "
-            f"({listed(small)}): take pictures between them, or leave one group out"
-        )
+    if len(groups) > 1 and len(groups[1]) >= LEAST_GROUP:
+        return f"{parted(groups, n)}: take pictures between them, or leave one group out"
     return (
         f"only {len(placed)} of {n} photographs could be placed: each must show half of what another shows, from a place "
         f"beside it; left out: {listed([name for name in names if name not in set(placed)])}"
@@ -97,10 +110,14 @@ def remarks(result: dict[str, Any], names: Sequence[str]) -> list[str]:
     if left:
         features = result["features"]
         few = [name for name in left if features.get(name, 0) < FEW_FEATURES]
-        why = "they share too little with the others"
+        groups = groups_of(result, names)
+        apart = len(groups) > 1 and len(groups[1]) >= LEAST_GROUP and not placed.intersection(groups[1])
+        why = f"they share too little with the others: {listed(left)}"
         if len(few) > len(left) / 2:
-            why = "they show blur or bare walls"
-        said.append(f"{len(placed)} of {len(names)} photographs were placed; {why}: {listed(left)}")
+            why = f"they show blur or bare walls: {listed(left)}"
+        elif apart:
+            why = f"{parted(groups, len(names))}; pictures between them would join them"
+        said.append(f"{len(placed)} of {len(names)} photographs were placed; {why}")
     if result["error_pixels"] > LARGE_ERROR:
         said.append(
             f"the cameras fit the pictures to {result['error_pixels']:.1f} pixels only, where 1 is usual: something moved, "

@@ -133,7 +133,7 @@ class Run:
         self.phase_started, self.running = 0.0, math.nan
         self.interrupted = False
         self.watch: Watch | None = None
-        self._claimed = saved is not None
+        self._claimed = False
         self._log: BinaryIO | None = None
         self._entered = False  # a phase, without a step since
         self._reserve = self._time_to_finish()

@@ -10,7 +10,7 @@ from nerfvol.native import native
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.poses.test_make import small, stub
 
-BUDGET = "4s"
+BUDGET, OTHER = "4s", "3s"
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,12 @@ def with_stub(monkeypatch):
 
 @pytest.mark.skipif(native() is None, reason="the reference path takes minutes")
 def test_every_step_once_however_often_it_is_stopped(command, photos, tmp_path, with_stub, monkeypatch):
-    run, arguments = tmp_path / "run", ("--time-budget", BUDGET, "--views", 3, "--size", 200, "--threads", 1)
+    run, arguments = tmp_path / "run", ("--views", 3, "--size", 200, "--threads", 1)
 
-    def capture():
-        return command("capture", photos, "--out", run, *arguments)
+    def capture(budget=None):
+        return command(
+            "capture", photos, "--out", run, *arguments, *(() if budget is None else ("--time-budget", budget))
+        )
 
     import nerfvol.film
     import nerfvol.training.train as training
@@ -56,17 +58,17 @@ def test_every_step_once_however_often_it_is_stopped(command, photos, tmp_path, 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(training, "optimise", stopped)
-    assert capture()[0] == 130 and len(with_stub) == 1 and (run / "scene" / "poses.json").is_file()
+    assert capture(BUDGET)[0] == 130 and len(with_stub) == 1 and (run / "scene" / "poses.json").is_file()
     assert not (run / "splats.safetensors").exists()
 
     def going_on(run, phase, bar):
-        seen.append(run.phase)
+        seen.append((run.phase, run.config.time_budget))
         step(run, phase, bar)
 
     monkeypatch.setattr(training, "optimise", going_on)
     monkeypatch.setattr(nerfvol.film, "write_videos", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
-    code, out, _ = capture()
-    assert code == 130 and seen == ["splats"] and "resumed at step 1" in out and len(with_stub) == 1
+    code, out, _ = capture(OTHER)
+    assert code == 130 and seen == [("splats", 3.0)] and "resumed at step 1" in out and len(with_stub) == 1
     assert (run / "splats.safetensors").exists() and not (run / "video.mp4").exists()
     monkeypatch.undo()
     monkeypatch.setattr("nerfvol.poses.make.require_pycolmap", lambda: None)
@@ -78,6 +80,11 @@ def test_every_step_once_however_often_it_is_stopped(command, photos, tmp_path, 
     assert capture()[0] == 0 and made == (run / "video.mp4").stat().st_mtime_ns
     table = (run / "photographs.csv").read_text().splitlines()
     assert len(table) == 1 + 7 and json.loads((run / "metrics.json").read_text())["representation"] == "splats"
+    trained = []
+    monkeypatch.setattr(training, "train", lambda config, *_: trained.append((config.time_budget, config.resume)))
+    assert capture(OTHER)[0] == 0 and not trained
+    code, out, _ = capture("5s")
+    assert code == 0 and trained == [(5.0, False)] and "had a time budget of 3.0 s" in out and "previous" in out
 
 
 def test_photographs_without_poses_are_told_what_to_do(command, photos, tmp_path):

@@ -114,6 +114,17 @@ def test_poses_that_do_not_fit_the_points_of_the_model_are_doubted(tmp_path, tex
         assert any("these are not the poses of the photographs" in m for m in load_dataset(tmp_path).messages)
 
 
+@pytest.mark.parametrize("text", [False, True])
+def test_poses_that_fit_badly_are_said_so(tmp_path, text):
+    """By the errors that the model states; -1 is COLMAP's word for one that was not computed."""
+    scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), text=text, model="PINHOLE")
+    for error, said in ((3.25, True), (1.5, False), (-1.0, False)):
+        scenes.write_points(tmp_path, scenes.ring(), [(0.0, 0.0, 0.0)] * 5, text=text, error=error)
+        messages = load_dataset(tmp_path).messages
+        assert any("3.2 pixels or more" in m and "nerfvol poses" in m for m in messages) == said, error
+        assert any("the poses fit badly" in m for m in messages) == said, error
+
+
 @pytest.mark.parametrize("nowhere", [np.nan, np.inf, -1e308])
 def test_points_that_are_nowhere_are_in_no_image(tmp_path, nowhere):
     scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), model="PINHOLE")

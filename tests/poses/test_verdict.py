@@ -24,7 +24,8 @@ def test_groups_hang_together_by_verified_pairs():
 
 
 @pytest.mark.parametrize("got,sentence", [
-    (result([*chain(0, 4), *chain(5, 8), *chain(9, 11)], NAMES[:5]), "5 of 12 .* 4 more form a group .*05.jpg, 06.jpg, 07.jpg"),
+    (result([*chain(0, 4), *chain(5, 8), *chain(9, 11)], NAMES[:5]), r"5 of 12 .*\(00.jpg, .*04.jpg\); "
+     r"4 more form a group .*\(05.jpg, 06.jpg, 07.jpg, 08.jpg\); 3 are in smaller groups: take pictures between"),
     (result([], []), "no two of the 12 photographs share enough"),
     (result([], [], features=80), "80 features each where 1,000 are usual: blur or bare walls"),
     (result(chain(0, 11), NAMES, parallax=0.001), "turning on the spot"),
@@ -44,6 +45,14 @@ def test_half_is_enough_and_the_rest_is_named():
     got = result(chain(0, 11), NAMES[:8])
     assert failure(got, NAMES) is None
     assert remarks(got, NAMES)[0].startswith("8 of 12 photographs were placed") and "08.jpg" in remarks(got, NAMES)[0]
+
+
+def test_a_group_that_is_left_out_is_named():
+    got = result([*chain(0, 6), *chain(7, 11)], NAMES[:7])
+    assert failure(got, NAMES) is None
+    said = remarks(got, NAMES)[0]
+    assert "7 of 12 photographs hang together (00.jpg, 01.jpg" in said and "5 more form a group" in said
+    assert "(07.jpg, 08.jpg, 09.jpg, 10.jpg, 11.jpg)" in said
 
 
 @pytest.mark.parametrize("camera,sentence", [
