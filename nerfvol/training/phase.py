@@ -73,7 +73,7 @@ class Phase(Protocol):
         ...
 
     def seconds_to_write(self) -> float:
-        """Seconds that writing and reading the product will take."""
+        """Seconds that finishing, writing and reading the product will take."""
         ...
 
     def needs_images(self) -> bool:

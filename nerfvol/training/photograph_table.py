@@ -56,7 +56,8 @@ class Row:
 def write_table(path: Path, dataset: Dataset, phase: FinalPhase) -> str:
     """Writes a row for each training photograph as CSV, the worst first, and the page of thumbnails beside it; returns a
     sentence for a person."""
-    rows = sorted(make_rows(dataset, phase), key=lambda row: row.psnr)
+    small: _Small = {}
+    rows = sorted(make_rows(dataset, phase, small), key=lambda row: row.psnr)
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(
@@ -68,7 +69,9 @@ def write_table(path: Path, dataset: Dataset, phase: FinalPhase) -> str:
     write_text(path, text.getvalue())
     said, page = advice(rows, path.name), path.with_suffix(".html")
     entries = [(row.name, _known(row), row.remark) for row in rows]
-    write_page(page, f"{len(rows)} photographs", said, entries, (_pictures(phase, row.index) for row in rows[:MOST]))
+    write_page(
+        page, f"{len(rows)} photographs", said, entries, (_pictures(phase, row.index, small) for row in rows[:MOST])
+    )
     return f"{said.removesuffix(')')}; thumbnails: {page.name})"
 
 
@@ -77,17 +80,33 @@ def _known(row: Row) -> str:
     return f"{row.psnr:.1f} dB, sharpness {row.sharpness:.2f} of neighbours', exposure {row.exposure:.2f} of the mean{moved}"
 
 
-def _pictures(phase: FinalPhase, i: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+_Small = dict[int, tuple[NDArray[np.uint8], NDArray[np.uint8], Any]]
+"""By view: its small photograph, what the model shows, both of 8 bits, and the pixels' weights."""
+
+
+def _pictures(phase: FinalPhase, i: int, small: _Small) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """View i small, as it was taken and as the model shows it; what is masked is black in both."""
-    photograph, shown, weight = phase.seen(i)
+    photograph, shown, weight = small[i] if i in small else _eight_bits(*phase.seen(i))
     counts = np.asarray(weight)[..., None] > 0
-    return photograph * counts, np.clip(apply_map(phase.appearance.maps[i], np.clip(shown, 0, 1)), 0, 1) * counts
+    mapped = apply_map(phase.appearance.maps[i], shown / np.float32(255))
+    return photograph / np.float32(255) * counts, np.clip(mapped, 0, 1) * counts
 
 
-def make_rows(dataset: Dataset, phase: FinalPhase) -> list[Row]:
-    """A row for each photograph of ``dataset``, in its order."""
+def _eight_bits(photograph: Any, shown: Any, weight: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Any]:
+    first, second = (np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8) for picture in (photograph, shown))
+    return first, second, weight
+
+
+def make_rows(dataset: Dataset, phase: FinalPhase, small: _Small | None = None) -> list[Row]:
+    """A row for each photograph of ``dataset``, in its order; ``small`` keeps the pictures that were drawn for it, of the first
+    MOST views."""
     maps = phase.appearance.maps
-    errors = np.array([_psnr(*phase.seen(i), maps[i]) for i in range(len(dataset))])
+    errors = np.empty(len(dataset))
+    for i in range(len(dataset)):
+        seen = phase.seen(i)
+        errors[i] = _psnr(*seen, maps[i])
+        if small is not None and i < MOST:
+            small[i] = _eight_bits(*seen)
     own = dataset.pyramid((1, 1, 1), 1, lambda image: sharpness(_grey(image)))
     sharp = relative_to_neighbours(np.array(own), dataset.names)
     bad, refined = outliers(errors), phase.refined()

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from nerfvol.cameras.camera import Camera
 from nerfvol.cameras.paths import describe_orbit
 from nerfvol.config.training import Config
 from nerfvol.datasets.images import composite_average
@@ -32,6 +33,7 @@ from nerfvol.measure.metrics import ssim
 from nerfvol.medium.model import MediumModel
 from nerfvol.models import Model
 from nerfvol.neural import FieldModel
+from nerfvol.training.appearance import fitting_factor
 from nerfvol.training.compiled_field import compiled_refusal
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder
@@ -42,7 +44,9 @@ RESERVE_SHARE = 0.2
 EXPECTED_SECONDS_TO_WRITE = 2.0
 """Before there is a representation that tells."""
 TABLE_SECONDS = 0.008
-"""For a training photograph's row in the table of photographs."""
+"""For a training photograph's row in the table of photographs, besides its small picture."""
+LOOK_AGAIN = 0.08
+"""Of a time budget: as often, at most, is the time to finish estimated anew because a representation has grown."""
 FIT_SECONDS = 0.5
 """For a held-out view's pose, where cameras are refined."""
 RUNNING = 0.98
@@ -137,6 +141,7 @@ class Run:
         self._log: BinaryIO | None = None
         self._entered = False  # a phase, without a step since
         self._reserve = self._time_to_finish()
+        self._looked, self._size_then = self.clock.elapsed(), ""
         self._last_save = time.perf_counter()
         self._warned: set[str] = set()
 
@@ -266,7 +271,21 @@ class Run:
         return_free_memory()
         if (sentence := phase.outgrown()) is not None:
             self.say(sentence)
+        self._look_again(phase)
+
+    def keep_time(self, phase: Phase) -> None:
+        """Estimate anew what finishing takes once the representation has another size: an octree may double inside a stage."""
+        budget = self.config.time_budget
+        if (
+            budget is not None
+            and self.clock.elapsed() - self._looked >= LOOK_AGAIN * budget
+            and phase.size() != self._size_then
+        ):
+            self._look_again(phase)
+
+    def _look_again(self, phase: Phase) -> None:
         self._reserve = self._time_to_finish(phase)
+        self._looked, self._size_then = self.clock.elapsed(), phase.size()
 
     def release_images(self, phase: Phase) -> None:
         """Release the training images once the phase will not ask for them again."""
@@ -339,7 +358,7 @@ class Run:
     def _time_to_finish(self, phase: Phase | None = None) -> float:
         """Seconds to keep for writing, reading the views and scoring.
 
-        Reading took a time at the start, scoring is measured on one view; without a phase, the rest is guessed.
+        Reading took a time at the start, scoring and drawing are measured on one view; without a phase, the rest is guessed.
         """
         if self.config.time_budget is None:
             return 0.0
@@ -347,18 +366,28 @@ class Run:
         image = self.data.first.composited(0, self.background)
         ssim(image, image)
         scoring = (time.perf_counter() - started) / ops.get_threads()  # so many views are scored side by side
-        started = time.perf_counter()
+        rendering = 0.1e-6 * image.size / 3
+        small = 0.0
         if phase is not None:
-            phase.picture(self.data.held_out.cameras[0])
-        rendering = 0.1e-6 * image.size / 3 if phase is None else time.perf_counter() - started
+            rendering = _seconds(phase.picture, self.data.held_out.cameras[0])
+            if self.data.training.scene.is_unbounded:
+                camera = self.data.training.cameras[0]
+                lens = camera.intrinsics
+                small = _seconds(phase.picture, camera.scaled(fitting_factor(lens.width, lens.height)))
         writing = EXPECTED_SECONDS_TO_WRITE if phase is None else phase.seconds_to_write()
         return min(
             writing
             + self.data.reading
-            + TABLE_SECONDS * len(self.data.training)
+            + (TABLE_SECONDS + small) * len(self.data.training)
             + 1.1 * len(self.data.held_out) * (scoring + rendering + FIT_SECONDS * self.config.refine_poses),
             RESERVE_SHARE * self.config.time_budget,
         )
+
+
+def _seconds(draw: Callable[[Camera], object], camera: Camera) -> float:
+    started = time.perf_counter()
+    draw(camera)
+    return time.perf_counter() - started
 
 
 def decibels(squared_error: float) -> float:

@@ -50,7 +50,7 @@ from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
 from nerfvol.training.refined import write_refined
-from nerfvol.training.session import RESERVE_SHARE, Clock, Run, Say, Watch, read_saved
+from nerfvol.training.session import Clock, Run, Say, Watch, read_saved
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 
@@ -248,6 +248,7 @@ def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
             run.follow(phase, report.squared_error)
             before, progress = progress, run.progress(phase)
             run.claim(phase)
+            run.keep_time(phase)
             if phase.steps_done % LOG_EVERY == 0 or progress >= 1:
                 run.log(phase, progress, report)
             bar.set_postfix_str(run.status(phase, report), refresh=False)
@@ -332,19 +333,27 @@ def finish(run: Run, trained: list[Model]) -> Results:
 
 
 def affordable_views(run: Run, model: Model, held_out: Dataset) -> Dataset:
-    """The held-out views that can be scored in what a time budget leaves, or in the share of it that is kept for that; all
-    where there is no budget. Slow are the octrees of photographs that had seconds only: they are fog."""
+    """The held-out views that can be scored in what a time budget leaves, FEWEST_SCORED at least; all where there is no budget.
+    Slow are the octrees of photographs that had seconds only: they are fog."""
     budget = run.config.time_budget
     if budget is None:
         return held_out
-    started = time.perf_counter()
-    model.render(held_out.cameras[0], run.background)
-    each, left = time.perf_counter() - started, max(budget - run.clock.elapsed(), RESERVE_SHARE * budget)
-    n = max(FEWEST_SCORED, int(left / each))
+
+    def seconds_a_view() -> float:
+        started = time.perf_counter()
+        evaluate(model, held_out.evenly(1), run.background)
+        return time.perf_counter() - started
+
+    def affordable(each: float) -> int:
+        return max(FEWEST_SCORED, int((budget - run.clock.elapsed()) / each))
+
+    n = affordable(each := seconds_a_view())
+    if FEWEST_SCORED < len(held_out) > n:  # the first one also made what all share: prefiltered nodes, the lens's rays
+        n = affordable(each := seconds_a_view())
     if n >= len(held_out):
         return held_out
-    run.say(f"a view takes {each:.1f} s to draw: {n} of the {len(held_out)} held-out views are scored, evenly chosen, to keep "
-            "near the time budget; nerfvol eval scores all")  # fmt: skip
+    run.say(f"a view takes {each:.1f} s to draw and score: {n} of the {len(held_out)} held-out views are scored, evenly "
+            "chosen, to keep near the time budget; nerfvol eval scores all")  # fmt: skip
     return held_out.evenly(n)
 
 

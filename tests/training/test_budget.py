@@ -6,6 +6,7 @@ import re
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from nerfvol.cli.command import set_threads
@@ -163,15 +164,43 @@ def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
     assert most_steps(1.0) == most_steps(0.5) > 0  # however few the tiles
 
 
-@pytest.mark.parametrize("seconds, scored", [(0.05, 2), (0.0, None)])
-def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, seconds, scored):
-    """A tenth of a second for the end, less than two views of 50 ms take: two are scored all the same, evenly chosen."""
-    said = []
-    run = run_of(settings(tiny_scene, tmp_path, time_budget=0.5 if scored else 1e6))
+@pytest.mark.parametrize("left, scored, timed", [(12, 3, 2), (17, 5, 2), (24, 5, 1), (-1, 2, 2)])
+def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, monkeypatch, left, scored, timed):
+    """By a clock that only pictures put on: 2 seconds each, 4 the first one, which makes what all share (prefiltered nodes).
+
+    Of 12 seconds 6 are left after two timed pictures: three views of five. Of 17 it is 11, of 24 after one picture 20: all.
+    """
+    said, pictures = [], []
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
     run.say = said.append
-    held_out = run.data.training
-    model = SimpleNamespace(render=lambda camera, background: time.sleep(seconds))
-    views = affordable_views(run, model, held_out)
-    assert len(views) == (scored or len(held_out)) and len(held_out) > 2
+    held_out = run.data.training.evenly(5)
+
+    def seconds() -> float:
+        return 2.0 * len(pictures) + 2.0 * bool(pictures)
+
+    def render(camera, background, outputs, early_stop_eps, lod):
+        pictures.append(np.zeros((camera.intrinsics.height, camera.intrinsics.width, 3), np.float32))
+        return {"rgb": pictures[-1]}
+
+    monkeypatch.setattr(session.time, "perf_counter", seconds)
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0 - left + seconds())
+    views = affordable_views(run, SimpleNamespace(kind="octree", render=render), held_out)
+    assert (len(views), len(pictures)) == (scored, timed)
     assert views.names[0] == held_out.names[0] and views.names[-1] == held_out.names[-1]
-    assert bool(scored) == any(f"2 of the {len(held_out)} held-out views are scored" in line for line in said)
+    assert (scored < 5) == any(f"{scored} of the 5 held-out views are scored" in line for line in said)
+
+
+def test_a_representation_that_grew_is_asked_anew(tmp_path, tiny_scene, monkeypatch):
+    """What finishing takes: once it has another size, and not again before a share of the budget is over."""
+    now, asked = [0.0], []
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: now[0])
+    monkeypatch.setattr(session.Run, "_time_to_finish", lambda self, phase=None: asked.append(now[0]) or 1.0)
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
+    phase, size = Pretended("octree"), [0]
+    phase.size = lambda: f"{size[0]} leaves"
+    phase.picture = lambda camera: None
+    run.enter_stage(phase)
+    asked.clear()
+    for now[0], size[0] in [(5, 0), (6, 1), (9, 1), (10, 1), (12, 2), (17, 2), (30, 2)]:
+        run.keep_time(phase)
+    assert asked == [9, 17]
