@@ -74,6 +74,18 @@ def microflakes(*S: ArrayLike, diffuse: bool = False) -> Phase:
 
 
 @jit
+def with_g(phase, g):
+    """The phase function with another g1."""
+    return Phase(phase.kind, g, phase.g2, phase.mix, phase.S, phase.own)
+
+
+@jit
+def with_S(phase, S):
+    """The phase function with an SGGX matrix of the place, six numbers."""
+    return Phase(phase.kind, phase.g1, phase.g2, phase.mix, phase.S, S)
+
+
+@jit
 def flakes_at(phase, attribute):
     """The six numbers of S: of the place, else of the nearest row for an attribute in [0, 1]."""
     if phase.own[0] > 0.0:
