@@ -49,6 +49,8 @@ def unknown(w: World) -> str:
         return "surfaces"
     if has_boundaries(w) or w.ambient != 0:
         return "boundaries"
+    if m.detail.octaves > 0:
+        return "detail below the grid"
     if m.phase.kind not in PHASES:
         return "microflakes"
     if max(abs(m.phase.g1), abs(m.phase.g2)) > MOST_FORWARD:

@@ -8,8 +8,8 @@ the next, so that once per view all of J is put down there next to rho, and a ma
 however many beams there are.
 
 An approximation: J is linear between samples. Its error falls with the square of the cell, at a shadow's edge with the
-cell. Not gathered are coloured extinction, microflakes, media that fill boundary surfaces, and lights at a finite
-distance.
+cell. Not gathered are coloured extinction, microflakes, detail below the grid, media that fill boundary surfaces, and lights
+at a finite distance.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def possible(w: World) -> bool:
     m = w.medium
     grey = m.sigma_t[0] == m.sigma_t[1] == m.sigma_t[2]
     distant = bool(np.all(w.lights[:, 0] == DIRECTIONAL))
-    return m.kind == GRID and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not has_boundaries(w)
+    coarse = m.kind == GRID and m.detail.octaves == 0
+    return coarse and grey and distant and m.phase.kind < phases.SGGX_SPECULAR and not has_boundaries(w)
 
 
 def outside(m: Medium, eye: np.ndarray) -> bool:

@@ -88,7 +88,8 @@ class March:
             if not gather.outside(world.medium, eye):
                 return replace(self, resolution=MAP_RESOLUTION).sums(scene, camera, seed, part)
             mode, rho_J = march.GATHERED, gather.towards(world, gathered, eye)
-        lighting = march.Lighting(mode, maps, rho_J)
+        own = (float(self.rain), self.soft) if isinstance(self, Preview) else (1.0, False)
+        lighting = march.Lighting(mode, maps, rho_J, *own)
         out, data = np.empty((camera.height, camera.width, 5)), camera.data()
 
         def rows(first: int, last: int) -> None:
@@ -113,9 +114,19 @@ class Emission(March):
 
 @dataclass(frozen=True)
 class Preview(March):
-    """The Horizon-style cloud preview: an approximation that stands next to the answers of the others."""
+    """The Horizon-style cloud preview, 2 e^-(d r) HG powder: an approximation that stands next to the answers of the others.
 
+    rain: r where it pours (the medium's attribute is 1); it is 1 where it is dry. soft: with floors under e^-d and powder.
+    """
+
+    rain: float = 2.0
+    soft: bool = False
     mode: int = field(default=march.PREVIEW, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.rain < np.inf:
+            raise InputError(f"--rain: expected a number from 0 on, got {self.rain}")
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth import detail as details
 from data_synth import phase as phases
 from data_synth.checks import vector
 from data_synth.errors import InputError
 from data_synth.jit import jit
-from data_synth.sggx import projected_area
 from data_synth.vec import slab, trilinear
 
 Point = Sequence[float] | np.ndarray
@@ -37,7 +37,8 @@ class Medium(NamedTuple):
     bricks: bricks per axis; brick_size: their edges in u; cell: edges of a cell in u; offsets: (bricks,) first sample
     of a brick or -1; samples, attributes: float32; brick_max, brick_min: (bricks,) bounds of the density; sigma_t: RGB
     per density; albedo, Le: (K, 3) tables over the attribute; base, falloff: of the exponential; step: length of a
-    marching step in u; flake_area: largest projected area of the microflakes (1 without).
+    marching step in u; flake_area: largest projected area of the microflakes (1 without); detail: of a cloud, finer than
+    the grid.
     """
 
     kind: int
@@ -60,6 +61,7 @@ class Medium(NamedTuple):
     step: float
     flake_area: float
     phase: phases.Phase
+    detail: details.Detail
 
 
 def triple(values: Iterable[float]) -> tuple[float, float, float]:
@@ -110,10 +112,12 @@ def exponential(
 def grid(
     density: ArrayLike, lo: Point, hi: Point, sigma_t: ArrayLike = 1.0, albedo: ArrayLike = 0.0, Le: ArrayLike = 0.0,
     phase: phases.Phase | None = None, attribute: ArrayLike | None = None, majorant: float | None = None,
+    detail: details.Detail | None = None,
 ) -> Medium:  # fmt: skip
     """A heterogeneous medium of (nx, ny, nz) density samples at the vertices of a regular grid from lo to hi.
 
-    attribute: same shape, in [0, 1]. majorant: an upper bound the caller believes in; lower is an error.
+    attribute: same shape, in [0, 1]. majorant: an upper bound the caller believes in; lower is an error. detail: noise that
+    erodes the density, in [0, 1] then, wherever it is asked for (``detail.py``); z is up.
     """
     density = np.asarray(density)
     if density.ndim != 3 or min(density.shape) < 2:
@@ -127,7 +131,16 @@ def grid(
     stored = _bricks(density.astype(np.float32), attribute)
     cells = tuple(n - 1 for n in density.shape)
     medium = _medium(GRID, lo, hi, cells, stored[:2], sigma_t, albedo, Le, phase)
-    return medium._replace(offsets=stored[2], samples=stored[3], attributes=stored[4])
+    medium = medium._replace(offsets=stored[2], samples=stored[3], attributes=stored[4])
+    return medium if detail is None else _detailed(medium, detail)
+
+
+def _detailed(m: Medium, d: details.Detail) -> Medium:
+    """The medium eroded by detail, marched in steps of two samples of the finest noise, at the least a cell's eighth."""
+    if m.max_density > 1:
+        raise InputError(f"medium: a density with detail must be in [0, 1], got {m.max_density:g}")
+    sizes = [2 * (b - a) / n for a, b, n in zip(m.lo, m.hi, details.finest(d), strict=True)]
+    return m._replace(detail=d, brick_min=details.least(d, m.brick_min), step=min(m.step, max(min(sizes), m.step / 8)))
 
 
 def from_function(function: Callable, lo: Point, hi: Point, resolution: int = 128, **coefficients: Any) -> Medium:
@@ -169,7 +182,7 @@ def _medium(
     if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"medium: expected a box with lo < hi, got {lo} and {hi}")
     phase = phase or phases.isotropic()
-    area = math.sqrt(max(np.linalg.eigvalsh(_matrix(s))[-1] for s in phase.S))
+    area = phases.largest_area(phase)
     cell = triple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
     nx, ny, nz = (-(-n // BRICK) for n in cells) if kind == GRID else cells
     step = min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
@@ -178,16 +191,12 @@ def _medium(
         np.zeros(1, np.int64), np.zeros(1, np.float32), np.zeros(1, np.float32),
         np.ascontiguousarray(bounds[0], dtype=float), np.ascontiguousarray(bounds[1], dtype=float),
         float(np.max(bounds[0], initial=0.0)), rgb(sigma_t, "sigma_t"), _table(albedo, "albedo", 1.0),
-        _table(Le, "Le"), 0.0, 0.0, step, area, phase,
+        _table(Le, "Le"), 0.0, 0.0, step, area, phase, details.NONE,
     )  # fmt: skip
 
 
-def _matrix(s: Sequence[float]) -> np.ndarray:
-    return np.array([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]])
-
-
 def dense(m: Medium) -> np.ndarray:
-    """The (nx, ny, nz) float32 density samples of a grid medium, the truth to compare a reconstruction with."""
+    """The (nx, ny, nz) float32 density samples of a grid medium, without its detail."""
     out = np.zeros([n * BRICK + 1 for n in m.bricks], np.float32)
     side = (BRICK + 1,) * 3
     bricks = np.lib.stride_tricks.sliding_window_view(out, side, writeable=True)[::BRICK, ::BRICK, ::BRICK]
@@ -219,7 +228,11 @@ def interpolated(m, values, p):
 def density(m, p):
     """rho at a point inside the box."""
     if m.kind == GRID:
-        return interpolated(m, m.samples, p)
+        rho = interpolated(m, m.samples, p)
+        if m.detail.octaves > 0:
+            x, y, z = (p[0] - m.lo[0]) / m.cell[0], (p[1] - m.lo[1]) / m.cell[1], (p[2] - m.lo[2]) / m.cell[2]
+            return details.eroded(m.detail, rho, x / m.cells[0], y / m.cells[1], z / m.cells[2])
+        return rho
     if m.kind == EXPONENTIAL:
         return math.exp(-(p[2] - m.base) * m.falloff)
     return 1.0
@@ -236,7 +249,7 @@ def extinction(m, p, d):
     """rho at p, times the projected area of microflakes towards d: sigma_t(x, d) / sigma_t."""
     rho = density(m, p)
     if m.phase.kind >= phases.SGGX_SPECULAR and rho > 0.0:
-        rho *= projected_area(phases.flakes_at(m.phase, attribute(m, p)), d)
+        rho *= phases.projected_area(m.phase, attribute(m, p), d)
     return rho
 
 

@@ -110,7 +110,7 @@ def next_event(w, v, inside, beta, rng):
         m = medium_of(w, v.number)
         value = phase.evaluate(m.phase, attribute(m, v.p), v.wo, wi, rng)
         f = (value, value, value)
-        pdf_other = value if m.phase.kind != phase.SGGX_DIFFUSE else 0.0
+        pdf_other = value if phase.has_density(m.phase) else 0.0
         if w.lights[k, 0] == POINT:
             sigma = extinction(m, v.p, v.ray[1]) * largest(m.sigma_t)
             placed = equiangular.density(v.ray, v.t0, v.t1, column3(w.lights, k, 7), v.t)
@@ -215,7 +215,7 @@ def scatter_direction(w, v, rng):
         return materials.sample(w.materials, v.material, v.p, v.n, v.wo, rng)
     ph, a = medium_of(w, v.number).phase, attribute(medium_of(w, v.number), v.p)
     wi = phase.sample(ph, a, v.wo, rng)
-    known = ph.kind != phase.SGGX_DIFFUSE
+    known = phase.has_density(ph)
     return wi, (1.0, 1.0, 1.0), phase.evaluate(ph, a, v.wo, wi, rng) if known else UNKNOWN, False
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from data_synth import lights as lamps
 from data_synth import materials as stuff
-from data_synth import media, surfaces, truth, volumes
+from data_synth import media, spongecake, surfaces, truth, volumes
 from data_synth.cameras import Camera, Viewpoints
 from data_synth.channels import Channels, split
 from data_synth.errors import InputError, RenderWarning
@@ -81,7 +81,7 @@ class Scene:
             self.medium if self.medium is not None else NOTHING,
             pool(self.media),
             shapes,
-            stuff.Materials(self.boundaries(), _table(self.layers, 10)),
+            stuff.Materials(self.boundaries(), spongecake.stack(self.layers)),
             _table(rows, lamps.WIDTH),
             own[own[:, 0] == lamps.QUAD],
             own[own[:, 0] == lamps.SKY],

@@ -80,4 +80,8 @@ def _method(m: Medium, name: str, methods: dict) -> int:
         raise InputError(f"method: expected one of {', '.join(methods)}, got '{name}'")
     if name == "closed" and (m.kind not in (HOMOGENEOUS, EXPONENTIAL) or methods is DISTANCE_METHODS and m.kind):
         raise InputError("method: this medium has no closed form, expected another method than 'closed'")
+    if name == "regular" and m.detail.octaves:
+        raise InputError(
+            "method: a density with detail is no polynomial in a cell, expected another method than 'regular'"
+        )
     return methods[name]

@@ -6,13 +6,17 @@
 | ``mediumK_lo``, ``_hi``                 | its box                                                                     |
 | ``mediumK_sigma_t``                     | (3,) extinction per density in 1/u                                          |
 | ``mediumK_density``, ``_attribute``     | samples at the vertices of a grid from lo to hi; the attribute only if any  |
+| ``mediumK_micro``, ``_roughness``,     | of other microflakes: ``microflakes.py``; D: (n, rows + 1, columns) normals  |
+| ``_ior``, ``_D``                        | at polar angles 0 ... pi/2 and azimuths 0 ... 2 pi; none: S                  |
+| ``mediumK_noise``, ``_curl``, ``_tiles``| of a cloud with detail below its grid, as ``detail.py`` erodes the density;  |
+| ``mediumK_erosion``, ``_octaves``       | z from lo to hi is its height in [0, 1]                                      |
 | ... of kind rgb_grid                    | density and albedo are (nx, ny, nz, 3): extinction in 1/u, and albedo       |
 | ``mediumK_height``                      | exponential: density exp(-(z - lo_z) / height)                              |
 | ``mediumK_albedo``, ``_Le``             | (n, 3) tables over the attribute in [0, 1], linear in between               |
 | ``mediumK_phase``, ``_g``, ``_S``       | its name; g1, g2 and the weight of the first lobe; (n, 6) SGGX matrices     |
 | ``number``, ``number_lo``, ``number_hi``| medium at each vertex of a grid, -1 for none; media are cut by boundaries   |
 | ``shapes``, ``triangles``, ``materials``| tables as ``surfaces`` and ``materials`` describe them                      |
-| ``layers``, ``lights``                  | tables as ``spongecake`` and ``lights`` describe them                       |
+| ``layers``, ``layers_D``, ``lights``    | tables as ``spongecake``, ``microflakes`` and ``lights`` describe them       |
 """
 
 from __future__ import annotations
@@ -23,7 +27,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_synth import materials as stuff
-from data_synth import media, surfaces
+from data_synth import media, microflakes, spongecake, surfaces
+from data_synth import phase as phases
 from data_synth.channels import Channels
 from data_synth.files import replacing
 
@@ -32,7 +37,7 @@ if TYPE_CHECKING:
 
 RESOLUTION = 64  # cells along the longest side of ``number``
 KINDS = {media.HOMOGENEOUS: "homogeneous", media.GRID: "grid", media.EXPONENTIAL: "exponential"}
-PHASES = ("isotropic", "rayleigh", "henyey_greenstein", "sggx_specular", "sggx_diffuse")
+PHASES = ("isotropic", "rayleigh", "henyey_greenstein", "sggx_specular", "sggx_diffuse", "microflakes")
 
 
 def write(scene: Scene, path: Path) -> None:
@@ -43,10 +48,10 @@ def write(scene: Scene, path: Path) -> None:
             described = _channels(m) if isinstance(m, Channels) else _medium(m)
             arrays |= {f"medium{k}_{name}": np.asarray(value) for name, value in described.items()}
     lo, hi, number = numbers(scene)
-    geometry = surfaces.geometry(scene.shapes, scene.triangles)
+    geometry, layers = surfaces.geometry(scene.shapes, scene.triangles), spongecake.stack(scene.layers)
     arrays |= {
         "number": number, "number_lo": lo, "number_hi": hi, "shapes": geometry.shapes, "triangles": geometry.triangles,
-        "materials": scene.boundaries(), "layers": np.array(scene.layers, float).reshape(-1, 10),
+        "materials": scene.boundaries(), "layers": layers.rows, "layers_D": layers.table.D,
         "lights": np.array(scene.lights, float).reshape(-1, 16),
     }  # fmt: skip
     with replacing(path) as temporary:
@@ -64,10 +69,15 @@ def _medium(m: media.Medium) -> dict[str, object]:
         "kind": KINDS[m.kind], "lo": m.lo, "hi": m.hi, "sigma_t": m.sigma_t, "albedo": m.albedo, "Le": m.Le,
         "phase": PHASES[m.phase.kind], "g": (m.phase.g1, m.phase.g2, m.phase.mix), "S": m.phase.S,
     }  # fmt: skip
+    if m.phase.kind == phases.FLAKES:
+        micro = list(microflakes.MICRO)[m.phase.micro]
+        out |= {"micro": micro, "roughness": m.phase.roughness, "ior": m.phase.ior, "D": m.phase.table.D}
     if m.kind == media.GRID:
         out["density"] = media.dense(m)
         if m.attributes.size > 1:
             out["attribute"] = media.dense(m._replace(samples=m.attributes))
+        if m.detail.octaves:
+            out |= m.detail._asdict()
     if m.kind == media.EXPONENTIAL:
         out["height"] = 1.0 / m.falloff
     return out

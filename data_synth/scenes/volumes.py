@@ -22,16 +22,20 @@ EVENING_SKY = lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5))
 
 def cloud(
     coverage: float = 0.95, density: float = 22.0, resolution: int = 128, erosion: float = 0.3, seed: int = 0,
-    volume: str | None = None,
+    volume: str | None = None, detail: int = 0,
 ) -> Scene:  # fmt: skip
-    """a cumulus at sunset: warm sun from the side, blue sky above"""
+    """a cumulus at sunset: warm sun from the side, blue sky above
+
+    detail: octaves of noise that erode the cloud (or volume) where a ray asks for it, finer than any voxel; 0: at the voxels.
+    """
     lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
     shape = (resolution, resolution, int(resolution * 1.7 / 2.6))
     if volume is None:
-        rho = clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed)
+        rho = clouds.cloud("cumulus", shape, coverage, 1.0, 0.0 if detail else erosion, seed)
     else:
         rho, lo, hi = _imported(volume, lo, hi)
-    medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
+    fine = clouds.detail_of(cloud_textures(seed), 1.0, erosion, detail) if detail else None
+    medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE, detail=fine)
     return Scene(
         medium=medium,
         lights=[EVENING_SUN, EVENING_SKY],
