@@ -63,7 +63,7 @@ EMPTY = Table(np.zeros((0, 2, 1)), np.zeros((0, 2, 1)), np.zeros((0, 1)))
 
 
 def tabulated(D: Callable[[np.ndarray], ArrayLike] | ArrayLike, resolution: int = RESOLUTION) -> Table:
-    """The table of a function of (n, 3) unit normals, or of its (rows + 1, columns) values; D is area per sr, and is made even."""
+    """The table of a function of (n, 3) unit normals, or of its (rows + 1, columns) values: area per sr, which is made even."""
     if callable(D):
         if not 4 <= resolution <= 256:
             raise InputError(f"microflakes: resolution must be from 4 to 256, got {resolution}")
@@ -71,18 +71,18 @@ def tabulated(D: Callable[[np.ndarray], ArrayLike] | ArrayLike, resolution: int 
         values = 0.5 * (np.asarray(D(m.reshape(-1, 3)), float) + np.asarray(D(-m.reshape(-1, 3)), float))
         if values.shape != (m.size // 3,):
             raise InputError(f"microflakes: D must give one number for each normal, got shape {values.shape}")
-        values = values.reshape(m.shape[:2])
+        values = values.reshape(resolution + 1, 2 * resolution)
     else:
         values = np.array(D, float)
-    if values.ndim != 2 or min(values.shape) < 2 or values.shape[1] % 2 or max(values.shape) > 1024:
+    shape = values.shape
+    if len(shape) != 2 or min(shape) < 2 or shape[1] % 2 or max(shape) > 1024:
         raise InputError(f"microflakes: D must be a table of an even number of columns, got shape {values.shape}")
     if not np.isfinite(values).all() or values.min() < 0 or not values.max() > 0:
         raise InputError("microflakes: D must be finite, not negative, and somewhere positive")
-    half = values.shape[1] // 2
     values[0] = values[0].mean()  # one normal, the pole
-    values[-1] = 0.5 * (values[-1] + np.roll(values[-1], half))  # opposite normals on the equator
+    values[-1] = 0.5 * (values[-1] + np.roll(values[-1], shape[1] // 2))  # opposite normals on the equator
     corners = np.stack([values[:-1], values[1:], np.roll(values[:-1], -1, 1), np.roll(values[1:], -1, 1)])
-    steps = -np.diff(np.cos(np.linspace(0, 0.5 * np.pi, len(values))))[:, None] * 2 * np.pi / values.shape[1]
+    steps = -np.diff(np.cos(np.linspace(0, 0.5 * np.pi, len(values))))[:, None] * 2 * np.pi / shape[1]
     cumulative = np.cumsum(corners.max(axis=0) * steps)
     return Table(values[None], _projected(values)[None], cumulative[None])
 
@@ -103,8 +103,13 @@ def _projected(values: np.ndarray) -> np.ndarray:
     at = np.array([0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3)])
     theta = (np.arange(rows)[:, None] + at).ravel() * 0.5 * np.pi / rows
     phi = (np.arange(columns)[:, None] + at).ravel() * 2 * np.pi / columns
-    along = np.repeat(values[:-1], 2, 0) * np.tile(1 - at, rows)[:, None] + np.repeat(values[1:], 2, 0) * np.tile(at, rows)[:, None]
-    D = np.repeat(along, 2, 1) * np.tile(1 - at, columns) + np.repeat(np.roll(along, -1, 1), 2, 1) * np.tile(at, columns)
+    along = (
+        np.repeat(values[:-1], 2, 0) * np.tile(1 - at, rows)[:, None]
+        + np.repeat(values[1:], 2, 0) * np.tile(at, rows)[:, None]
+    )
+    D = np.repeat(along, 2, 1) * np.tile(1 - at, columns) + np.repeat(np.roll(along, -1, 1), 2, 1) * np.tile(
+        at, columns
+    )
     area = D * np.sin(theta)[:, None] * (0.5 * np.pi / rows) * (2 * np.pi / columns) / 4
     m, w = _directions(theta, phi).reshape(-1, 3).T, _nodes(rows, columns)
     return np.stack([np.abs(part @ m) @ area.ravel() for part in w])
@@ -122,7 +127,7 @@ def beckmann(axis: ArrayLike, roughness: float, resolution: int = RESOLUTION) ->
 
 
 def ggx(axis: ArrayLike, roughness: float, resolution: int = RESOLUTION) -> Table:
-    """Flakes that face ``axis``: GGX's 1 / (pi roughness^2 (cos^2 + sin^2/roughness^2)^2), which ``sggx.surface`` is exactly."""
+    """Flakes that face ``axis``: GGX's 1 / (pi roughness^2 (cos^2 + sin^2/roughness^2)^2), what ``sggx.surface`` is exactly."""
     n, a2 = direction(axis, "axis"), _checked(roughness) ** 2
     return tabulated(lambda m: 1 / (np.pi * a2 * ((m @ n) ** 2 + (1 - (m @ n) ** 2) / a2) ** 2), resolution)
 

@@ -28,7 +28,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from data_synth import channels, clouds, lights, materials, media, microflakes, phase, scenes, sggx, spongecake, surfaces, volumes
+from data_synth import (
+    channels,
+    clouds,
+    lights,
+    materials,
+    media,
+    microflakes,
+    phase,
+    scenes,
+    sggx,
+    spongecake,
+    surfaces,
+    volumes,
+)
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError
 from data_synth.integrators import INTEGRATORS
@@ -82,7 +95,7 @@ def cloud(
 def flakes_of(
     S: Any, diffuse: bool = False, micro: str | None = None, roughness: float = 0.3, ior: float = 1.5
 ) -> phase.Phase:
-    """Microflakes of one distribution: {fibre: ...}, {surface: ...}, {matrix: ...}, {beckmann: ...}, {ggx: ...} or {trigonometric: ...}."""
+    """Microflakes of one distribution: {fibre: ...} or another kind of flakes."""
     return phase.microflakes(S, diffuse=diffuse, micro=micro, roughness=roughness, ior=ior)
 
 

@@ -160,7 +160,12 @@ def evaluate(layers, first, last, wo, wi):
     for k in range(first, last):
         s = flakes(layers, k)
         depth = depth_integral(layers.rows[k, 0], slant(s, wo), slant(s, wi), wo[2] * wi[2] > 0.0)
-        f = microflakes.half_vector_density(s, wo, wi) / (4.0 * cosines) * depth * other_legs(layers, first, last, k, wo, wi)
+        f = (
+            microflakes.half_vector_density(s, wo, wi)
+            / (4.0 * cosines)
+            * depth
+            * other_legs(layers, first, last, k, wo, wi)
+        )
         F = mirrored(layers, k, wo, wi)
         r, g, b = r + f * F[0], g + f * F[1], b + f * F[2]
     return (r, g, b)

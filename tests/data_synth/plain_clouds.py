@@ -1,4 +1,4 @@
-"""Clouds in plain Python (NUMBA_DISABLE_JIT=1; test_plain.py runs this file): detail below the voxel, weather, rain, preview."""
+"""Clouds in plain Python (NUMBA_DISABLE_JIT=1; test_plain.py runs it): detail below the voxel, weather, rain, preview."""
 
 import numpy as np
 import pytest
@@ -183,5 +183,3 @@ def test_preview_is_the_published_formula(d):
     assert preview_energy(d, 2.0, False) == pytest.approx(want * np.exp(-d), abs=1e-15)
     assert preview_energy(d, 1.0, True) > preview_energy(d, 1.0, False)
     assert preview_energy(4.0, 1.0, False) == pytest.approx(0.0366, abs=1e-4)
-
-

@@ -1,9 +1,22 @@
-"""Microflakes of any distribution in plain Python (NUMBA_DISABLE_JIT=1; test_plain.py runs this file), alone and in SpongeCake."""
+"""Microflakes of any distribution in plain Python (NUMBA_DISABLE_JIT=1; test_plain.py runs it), alone and in SpongeCake."""
 
 import numpy as np
 import pytest
 
-from data_synth import Camera, Path, fresnel, lights, look_at, media, microflakes, phase, pool, sggx, spongecake, surfaces
+from data_synth import (
+    Camera,
+    Path,
+    fresnel,
+    lights,
+    look_at,
+    media,
+    microflakes,
+    phase,
+    pool,
+    sggx,
+    spongecake,
+    surfaces,
+)
 from data_synth.errors import InputError
 from data_synth.materials import null, refracted
 from data_synth.microflakes import GLOSSY, REFRACTIVE, Normals
@@ -54,7 +67,11 @@ def test_tables_are_scaled_as_they_say():
     for name in ("facing", "fibre"):
         assert TABLES[name].sigma.max() == pytest.approx(1.0)
     across = unit(*np.cross(AXIS, (1, 0, 0)))
-    assert microflakes.projected_area(normals("facing"), across) < 0.5 < microflakes.projected_area(normals("fibre"), across)
+    assert (
+        microflakes.projected_area(normals("facing"), across)
+        < 0.5
+        < microflakes.projected_area(normals("fibre"), across)
+    )
     # |cos|^n integrates over max(cos, 0) to 2 pi / (n + 2) on its axis, and D is (n + 2) / 2 pi there
     assert microflakes.normal_density(normals("facing"), AXIS) == pytest.approx(10 / (2 * np.pi), rel=2e-2)
 
@@ -66,7 +83,9 @@ def test_a_tabulated_sggx_is_sggx():
         assert microflakes.projected_area(n, w) == pytest.approx(microflakes.projected_area(flat, w), rel=2e-3)
         assert microflakes.normal_density(n, w) == pytest.approx(microflakes.normal_density(flat, w), rel=1e-2)
         if k % 10 == 0:
-            table, own = (phase.evaluate(p, 0.0, WO, w, None) for p in (phase.microflakes(TABLES["SGGX"]), phase.microflakes(S)))
+            table, own = (
+                phase.evaluate(p, 0.0, WO, w, None) for p in (phase.microflakes(TABLES["SGGX"]), phase.microflakes(S))
+            )
             assert table == pytest.approx(own, rel=1.5e-2)
     ggx, surface = normals("GGX"), Normals(tuple(sggx.surface(AXIS, 0.5)), microflakes.EMPTY, -1)
     assert microflakes.projected_area(ggx, WI) == pytest.approx(microflakes.projected_area(surface, WI), rel=3e-3)
@@ -74,8 +93,8 @@ def test_a_tabulated_sggx_is_sggx():
 
 @pytest.mark.parametrize("name", ["Beckmann", "fibre"])
 def test_visible_normals_and_mirrored_directions_follow_their_densities(name):
-    n, ph, count = normals(name), phase.microflakes(TABLES[name]), 3000
-    grid, rng = SphereGrid(8, 8, 4), new_rng(1, 0)
+    n, ph, count = normals(name), phase.microflakes(TABLES[name]), 1500
+    grid, rng = SphereGrid(8, 6, 3), new_rng(1, 0)
     D = np.array([microflakes.normal_density(n, tuple(m)) for m in grid.directions])
     seen = grid.per_bin(np.maximum(grid.directions @ np.array(WO), 0) * D)
     drawn = np.array([microflakes.sample_visible_normal(n, WO, rng) for _ in range(count)])
@@ -99,29 +118,33 @@ def test_reciprocity(name):
 def test_a_flake_keeps_all_light_and_is_reciprocal(micro, a, ior):
     m = AXIS
     first, second = microflakes.frame(m)
-    u, turn = (np.arange(240) + 0.5) / 240, (np.arange(90) + 0.5) * 2 * np.pi / 90
-    for co in (0.97, 0.6, 0.15):
+    u, turn = (np.arange(100) + 0.5) / 100, (np.arange(48) + 0.5) * 2 * np.pi / 48
+    for co in (0.8, 0.2):
         wo = tuple(co * np.array(m) + np.sqrt(1 - co * co) * np.array(first))
         total = 0.0
         for side in (1.0, -1.0):
             for ui in u:
-                flat = np.sqrt(ui) * (np.cos(turn)[:, None] * np.array(first) + np.sin(turn)[:, None] * np.array(second))
+                flat = np.sqrt(ui) * (
+                    np.cos(turn)[:, None] * np.array(first) + np.sin(turn)[:, None] * np.array(second)
+                )
                 for wi in flat + side * np.sqrt(1 - ui) * np.array(m):
                     total += microflakes.micro_density(micro, a, ior, m, wo, tuple(wi)) / np.sqrt(1 - ui)
-        # the measure of the projected disc, du dphi / 2; edges of the blur in u are met to half a step of 1/240
-        assert total * 0.5 * (2 * np.pi) / (240 * 90) == pytest.approx(1.0, abs=1 / 240 / a + 2e-3)
+        # the measure of the projected disc, du dphi / 2; edges of the blur in u are met to half a step of 1/100
+        assert total * 0.5 * (2 * np.pi) / (100 * 48) == pytest.approx(1.0, abs=1 / 100 / a + 2e-3)
     rng = np.random.default_rng(0)
     for _ in range(200):
         wo, wi = (unit(*v) for v in rng.normal(size=(2, 3)))
         back = tuple(-x for x in m)
         mo, mi = (m if np.dot(m, w) > 0 else back for w in (wo, wi))
         there = microflakes.micro_density(micro, a, ior, mo, wo, wi) * abs(np.dot(m, wo))
-        assert there == pytest.approx(microflakes.micro_density(micro, a, ior, mi, wi, wo) * abs(np.dot(m, wi)), rel=1e-9)
+        assert there == pytest.approx(
+            microflakes.micro_density(micro, a, ior, mi, wi, wo) * abs(np.dot(m, wi)), rel=1e-9
+        )
 
 
 @pytest.mark.parametrize(("micro", "a"), [(GLOSSY, 0.4), (REFRACTIVE, 0.7)])
 def test_light_leaves_a_flake_as_its_density_says(micro, a):
-    grid, count, rng = SphereGrid(8, 8, 5), 3000, new_rng(2, 0)
+    grid, count, rng = SphereGrid(8, 8, 4), 2000, new_rng(2, 0)
     m, wo = (0.0, 0.0, 1.0), unit(0.5, 0.2, 0.6)
     p = grid.per_bin(np.array([microflakes.micro_density(micro, a, 1.6, m, wo, tuple(w)) for w in grid.directions]))
     drawn = np.array([microflakes.micro_sample(micro, a, 1.6, m, wo, rng) for _ in range(count)])
@@ -147,7 +170,9 @@ def test_fresnel_of_glass_and_metal():
     for cosine in (1.0, 0.7, 0.1):
         for eta in (1.5, 1 / 1.5):
             wo = (np.sqrt(1 - cosine**2), 0.0, cosine)
-            assert fresnel.reflectance(cosine, eta, 0.0) == pytest.approx(refracted((0, 0, 1), wo, 1 / eta)[1], abs=1e-12)
+            assert fresnel.reflectance(cosine, eta, 0.0) == pytest.approx(
+                refracted((0, 0, 1), wo, 1 / eta)[1], abs=1e-12
+            )
     eta, k = 0.2, 3.4
     assert fresnel.reflectance(1.0, eta, k) == pytest.approx(((eta - 1) ** 2 + k * k) / ((eta + 1) ** 2 + k * k))
     assert fresnel.reflectance(1e-9, eta, k) == pytest.approx(1.0) and fresnel.schlick(0.0, 0.3) == 1.0
@@ -175,7 +200,9 @@ def test_a_medium_of_many_keeps_its_flakes():
     air = media.homogeneous((0, 0, 0), (1, 1, 1))
     m = media.homogeneous((0, 0, 0), (1, 1, 1), phase=phase.microflakes(TABLES["fibre"], TABLES["GGX"], micro="glossy"))
     got = pool.medium_at(pool.pool([air, m, air]), 1)
-    assert got.phase[5:8] == m.phase[5:8] and all(np.array_equal(a, b) for a, b in zip(got.phase.table, m.phase.table, strict=True))
+    assert got.phase[5:8] == m.phase[5:8] and all(
+        np.array_equal(a, b) for a, b in zip(got.phase.table, m.phase.table, strict=True)
+    )
     assert media.extinction(got, (0.5,) * 3, WO) == phase.projected_area(m.phase, 0.0, WO) != 1.0
     assert phase.projected_area(m.phase, 1.0, WO) != phase.projected_area(m.phase, 0.0, WO)
     assert m.flake_area == m.phase.table.sigma.max()
@@ -196,7 +223,9 @@ def test_layers_agree_with_an_integral_over_depth(wi):
     want, h = np.zeros(3), unit(*(np.array(wo) + wi))
     cosine = float(np.dot(h, wo))
     taus = layers.rows[:, 0]
-    slants = np.array([[microflakes.projected_area(spongecake.flakes(layers, k), w) / abs(w[2]) for w in (wo, wi)] for k in range(3)])
+    slants = np.array(
+        [[microflakes.projected_area(spongecake.flakes(layers, k), w) / abs(w[2]) for w in (wo, wi)] for k in range(3)]
+    )
     F = (
         [fresnel.reflectance(cosine, 1.5, 0.0)] * 3,
         [fresnel.reflectance(cosine, eta, k) for eta, k in ((0.2, 3.4), (0.4, 2.4), (1.4, 1.9))],
@@ -218,7 +247,7 @@ def test_layers_agree_with_an_integral_over_depth(wi):
 
 @pytest.mark.parametrize("name", CAKES)
 def test_layers_of_any_flakes_are_sampled_by_their_pdf(name):
-    layers, wo, count, rng = spongecake.stack([CAKES[name]]), unit(0.4, -0.2, 0.7), 3000, new_rng(4, 0)
+    layers, wo, count, rng = spongecake.stack([CAKES[name]]), unit(0.4, -0.2, 0.7), 1500, new_rng(4, 0)
     grid = SphereGrid(8, 8, 4)
     expected = grid.per_bin(np.array([spongecake.pdf(layers, 0, 1, wo, tuple(w)) for w in grid.directions]))
     drawn = [spongecake.sample(layers, 0, 1, wo, rng) for _ in range(count)]

@@ -15,5 +15,7 @@ FILES = sorted(path.name for path in Path(__file__).parent.glob("plain_*.py"))
 def test_in_plain_python(name):
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     command = [*"-m pytest -q -x -n 0 -p no:cacheprovider".split(), f"tests/data_synth/{name}"]
-    done = subprocess.run([sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout[-3000:]
