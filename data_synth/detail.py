@@ -28,16 +28,18 @@ FINER, WEAKER = 4.0, 0.4
 
 
 class Detail(NamedTuple):
-    """noise: (n, n, n, 1) float32; curl: (p, p, 2) float32; tiles: of the noise along each side of the medium's box."""
+    """values: float32, (n, n, n) noise and (p, p, 2) curl noise, in one array, since every array makes every kernel that is
+    handed a medium slower to compile; tiles: of the noise along each side of the medium's box."""
 
-    noise: np.ndarray
-    curl: np.ndarray
+    values: np.ndarray
+    n: int
+    p: int
     tiles: tuple[float, float, float]
     erosion: float
     octaves: int
 
 
-NONE = Detail(np.zeros((1, 1, 1, 1), np.float32), np.zeros((1, 1, 2), np.float32), (1.0, 1.0, 1.0), 0.0, 0)
+NONE = Detail(np.zeros(3, np.float32), 1, 1, (1.0, 1.0, 1.0), 0.0, 0)
 
 
 def detail(textures: CloudTextures, tiles: object, erosion: float, octaves: int = 1) -> Detail:
@@ -48,12 +50,13 @@ def detail(textures: CloudTextures, tiles: object, erosion: float, octaves: int 
         raise InputError(f"cloud: octaves of detail must be a whole number from 1 to 8, got {octaves}")
     x, y, z = (float(n) for n in vector(tiles, "tiles"))  # pyright: ignore[reportArgumentType]
     noise = textures.detail @ np.array([0.625, 0.25, 0.125], np.float32)
-    return Detail(np.ascontiguousarray(noise[..., None]), textures.curl, (x, y, z), float(erosion), int(octaves))
+    values = np.concatenate([noise.ravel(), textures.curl.ravel()])
+    return Detail(values, len(noise), len(textures.curl), (x, y, z), float(erosion), int(octaves))
 
 
 def finest(d: Detail) -> tuple[float, float, float]:
     """Samples of the finest octave along each side of the box."""
-    x, y, z = (n * d.noise.shape[0] * FINER ** (d.octaves - 1) for n in d.tiles)
+    x, y, z = (n * d.n * FINER ** (d.octaves - 1) for n in d.tiles)
     return x, y, z
 
 
@@ -73,13 +76,14 @@ def pushed(curl, x, y, c):
 @jit
 def noise_at(d, x, y, z):
     """n(x) in [0, 1] at a point of the unit cube, z up."""
-    push = CURL_SHIFT * (1.0 - z)
-    sx = x + push * pushed(d.curl, CURL_TILES * x, CURL_TILES * y, 0)
-    sy = y + push * pushed(d.curl, CURL_TILES * x, CURL_TILES * y, 1)
+    size, push = d.n * d.n * d.n, CURL_SHIFT * (1.0 - z)
+    noise, curl = d.values[:size].reshape((d.n, d.n, d.n, 1)), d.values[size:].reshape((d.p, d.p, 2))
+    sx = x + push * pushed(curl, CURL_TILES * x, CURL_TILES * y, 0)
+    sy = y + push * pushed(curl, CURL_TILES * x, CURL_TILES * y, 1)
     total, weights, finer, weight = 0.0, 0.0, 1.0, 1.0
     for _ in range(d.octaves):
         total += weight * texture_at(
-            d.noise, finer * d.tiles[0] * sx, finer * d.tiles[1] * sy, finer * d.tiles[2] * z, 0
+            noise, finer * d.tiles[0] * sx, finer * d.tiles[1] * sy, finer * d.tiles[2] * z, 0
         )
         weights += weight
         finer, weight = FINER * finer, WEAKER * weight

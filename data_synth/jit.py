@@ -33,7 +33,9 @@ except ImportError as error:
 # _nrt=False: no array is ever made inside compiled code, so none needs its references counted. Counting them, with
 # atomic operations at every call that passes a scene along, took most of the time.
 OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
-jit = numba.njit(**OPTIONS)
+# No wrappers: compiled code alone calls these functions, and wrapping each of them for Python took a third of the time that
+# compiling takes. To call one from Python say function.py_func(...).
+jit = numba.njit(**OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
 @cache

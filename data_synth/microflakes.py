@@ -43,12 +43,33 @@ RESOLUTION = 48  # cells from pole to equator; twice as many around
 
 
 class Table(NamedTuple):
-    """K distributions. D, sigma: (K, rows + 1, columns) at polar angles 0 ... pi/2 and azimuths 0 ... 2 pi; cumulative:
-    (K, rows * columns), of the cells' largest D times their solid angle."""
+    """``kinds`` distributions. values: one array, since every array makes every kernel that is handed a medium slower to
+    compile: D, then sigma, each (kinds, rows + 1, columns) at polar angles 0 ... pi/2 and azimuths 0 ... 2 pi, then (kinds,
+    rows * columns) cumulative sums of the cells' largest D times their solid angle."""
 
-    D: np.ndarray
-    sigma: np.ndarray
-    cumulative: np.ndarray
+    values: np.ndarray
+    kinds: int
+    rows: int
+    columns: int
+
+    @property
+    def D(self) -> np.ndarray:
+        """(kinds, rows + 1, columns) area per sr."""
+        return self._part(0)
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(kinds, rows + 1, columns) projected areas."""
+        return self._part(1)
+
+    def _part(self, k: int) -> np.ndarray:
+        n = self.kinds * (self.rows + 1) * self.columns
+        return self.values[k * n : (k + 1) * n].reshape(self.kinds, self.rows + 1, self.columns)
+
+    @property
+    def cumulative(self) -> np.ndarray:
+        """(kinds, rows * columns)."""
+        return self.values[2 * self.D.size :].reshape(self.kinds, self.rows * self.columns)
 
 
 class Normals(NamedTuple):
@@ -59,7 +80,7 @@ class Normals(NamedTuple):
     row: int
 
 
-EMPTY = Table(np.zeros((0, 2, 1)), np.zeros((0, 2, 1)), np.zeros((0, 1)))
+EMPTY = Table(np.zeros(0), 0, 1, 1)
 
 
 def tabulated(D: Callable[[np.ndarray], ArrayLike] | ArrayLike, resolution: int = RESOLUTION) -> Table:
@@ -84,7 +105,8 @@ def tabulated(D: Callable[[np.ndarray], ArrayLike] | ArrayLike, resolution: int 
     corners = np.stack([values[:-1], values[1:], np.roll(values[:-1], -1, 1), np.roll(values[1:], -1, 1)])
     steps = -np.diff(np.cos(np.linspace(0, 0.5 * np.pi, len(values))))[:, None] * 2 * np.pi / shape[1]
     cumulative = np.cumsum(corners.max(axis=0) * steps)
-    return Table(values[None], _projected(values)[None], cumulative[None])
+    parts = [values.ravel(), _projected(values).ravel(), cumulative]
+    return Table(np.concatenate(parts), 1, shape[0] - 1, shape[1])
 
 
 def _nodes(rows: int, columns: int) -> np.ndarray:
@@ -138,7 +160,7 @@ def trigonometric(axis: ArrayLike, power: float, fibre: bool = False, resolution
     if not 0 <= power <= 200:
         raise InputError(f"microflakes: power must be in [0, 200], got {power}")
     table = tabulated(lambda m: (1 - (m @ n) ** 2 if fibre else (m @ n) ** 2) ** (0.5 * power), resolution)
-    return Table(*(a / table.sigma.max() for a in table))
+    return table._replace(values=table.values / table.sigma.max())
 
 
 def _checked(roughness: float) -> float:
@@ -153,57 +175,63 @@ def together(tables: list[Table]) -> Table:
         return EMPTY
     if len({t.D.shape[1:] for t in tables}) > 1:
         raise InputError("microflakes: expected tables of one resolution")
-    return Table(*(np.ascontiguousarray(np.concatenate(parts)) for parts in zip(*tables, strict=True)))
+    parts = [part.ravel() for name in ("D", "sigma", "cumulative") for part in (getattr(t, name) for t in tables)]
+    return tables[0]._replace(values=np.concatenate(parts), kinds=sum(t.kinds for t in tables))
 
 
 @jit
-def bilinear(values, k, w):
-    """Row k of D or sigma at a direction: both are even."""
-    rows, columns = values.shape[1] - 1, values.shape[2]
+def bilinear(table, block, w):
+    """Block k of the table, D of row k, or kinds + k, its sigma, at a direction: both are even."""
+    rows, columns, values = table.rows, table.columns, table.values
     s = 1.0 if w[2] >= 0.0 else -1.0
     v = math.acos(min(s * w[2], 1.0)) * (2.0 / math.pi) * rows
     u = math.atan2(s * w[1], s * w[0]) * (0.5 / math.pi) * columns
     if u < 0.0:
         u += columns
     i, j = min(int(v), rows - 1), min(int(u), columns - 1)
-    v, u, a = v - i, u - j, (j + 1) % columns
-    near = values[k, i, j] * (1.0 - v) + values[k, i + 1, j] * v
-    return near * (1.0 - u) + (values[k, i, a] * (1.0 - v) + values[k, i + 1, a] * v) * u
+    v, u = v - i, u - j
+    at = (block * (rows + 1) + i) * columns
+    a = at + (j + 1) % columns
+    at += j
+    near = values[at] * (1.0 - v) + values[at + columns] * v
+    return near * (1.0 - u) + (values[a] * (1.0 - v) + values[a + columns] * v) * u
 
 
 @jit
 def projected_area(n, w):
-    return sggx.projected_area(n.S, w) if n.row < 0 else bilinear(n.table.sigma, n.row, w)
+    return sggx.projected_area(n.S, w) if n.row < 0 else bilinear(n.table, n.table.kinds + n.row, w)
 
 
 @jit
 def normal_density(n, m):
-    return sggx.normal_density(n.S, m) if n.row < 0 else bilinear(n.table.D, n.row, m)
+    return sggx.normal_density(n.S, m) if n.row < 0 else bilinear(n.table, n.row, m)
 
 
 @jit
 def sample_table(table, k, w, rng):
     """Cells in proportion to their bounds, a uniform point of the cell, kept with the chance D |w.m| / bound."""
-    rows, columns = table.D.shape[1] - 1, table.D.shape[2]
+    rows, columns, values = table.rows, table.columns, table.values
     cells = rows * columns
+    first = 2 * table.kinds * (rows + 1) * columns + k * cells  # of the cumulative sums
     while True:
-        u = uniform(rng) * table.cumulative[k, cells - 1]
+        u = uniform(rng) * values[first + cells - 1]
         low, high = 0, cells - 1
         while low < high:
             middle = (low + high) // 2
-            if table.cumulative[k, middle] > u:
+            if values[first + middle] > u:
                 high = middle
             else:
                 low = middle + 1
         i, j = low // columns, low % columns
-        a = (j + 1) % columns
-        bound = max(table.D[k, i, j], table.D[k, i + 1, j], table.D[k, i, a], table.D[k, i + 1, a])
+        at = (k * (rows + 1) + i) * columns
+        a = at + (j + 1) % columns
+        bound = max(values[at + j], values[at + j + columns], values[a], values[a + columns])
         top, bottom = math.cos(0.5 * math.pi * i / rows), math.cos(0.5 * math.pi * (i + 1) / rows)
         z = bottom + (top - bottom) * uniform(rng)
         phi, r = 2.0 * math.pi * (j + uniform(rng)) / columns, math.sqrt(max(1.0 - z * z, 0.0))
         m = (r * math.cos(phi), r * math.sin(phi), z)
         seen = dot(m, w)
-        if uniform(rng) * bound < bilinear(table.D, k, m) * abs(seen):
+        if uniform(rng) * bound < bilinear(table, k, m) * abs(seen):
             return m if seen > 0.0 else neg(m)
 
 

@@ -104,7 +104,7 @@ def microflakes(
 
 def largest_area(phase: Phase) -> float:
     """The largest projected area of the flakes, 1 without: a factor of majorants."""
-    if len(phase.table.sigma):
+    if phase.table.kinds:
         return float(phase.table.sigma.max())
     matrices = [np.array([[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]]) for s in phase.S]
     return math.sqrt(max(np.linalg.eigvalsh(matrix)[-1] for matrix in matrices))
@@ -122,7 +122,7 @@ def flakes_at(phase, attribute):
 @jit
 def normals_at(phase, attribute):
     """The distribution of flakes for an attribute in [0, 1]: the nearest one."""
-    rows = phase.table.D.shape[0]
+    rows = phase.table.kinds
     row = min(max(int(attribute * (rows - 1) + 0.5), 0), rows - 1) if rows > 0 else -1
     return flakes.Normals(flakes_at(phase, attribute), phase.table, row)
 

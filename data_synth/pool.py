@@ -17,7 +17,7 @@ ARRAYS = ("offsets", "samples", "attributes", "brick_max", "brick_min", "albedo"
 
 
 class Media(NamedTuple):
-    """numbers: (n, 48) the numbers of each medium; first: (n + 1, 13) where its arrays start in the arrays of all."""
+    """numbers: (n, 48) the numbers of each medium; first: (n + 1, 10) where its arrays start in the arrays of all."""
 
     numbers: np.ndarray
     first: np.ndarray
@@ -29,32 +29,25 @@ class Media(NamedTuple):
     albedo: np.ndarray
     Le: np.ndarray
     S: np.ndarray
-    noise: np.ndarray
-    curl: np.ndarray
-    D: np.ndarray
-    sigma: np.ndarray
-    cumulative: np.ndarray
+    detail: np.ndarray
+    flakes: np.ndarray
 
 
 def pool(media: Sequence[Medium]) -> Media:
     """Put the arrays of several media one behind the other."""
-    numbers, first = np.zeros((len(media), 48)), np.zeros((len(media) + 1, 13), np.int64)
+    numbers, first = np.zeros((len(media), 48)), np.zeros((len(media) + 1, 10), np.int64)
     for k, m in enumerate(media):
         row = [m.kind, *m.lo, *m.hi, *m.cells, *m.bricks, *m.cell, m.max_density, *m.sigma_t, m.base, m.falloff, m.step]
         row += [m.flake_area, m.phase.kind, m.phase.g1, m.phase.g2, m.phase.mix]
-        row += [*m.detail.tiles, m.detail.erosion, m.detail.octaves, len(m.detail.noise), len(m.detail.curl)]
-        row += [m.phase.micro, m.phase.roughness, m.phase.ior, *m.phase.table.D.shape]
+        row += [*m.detail.tiles, m.detail.erosion, m.detail.octaves, m.detail.n, m.detail.p]
+        row += [m.phase.micro, m.phase.roughness, m.phase.ior, *m.phase.table[1:]]
         numbers[k, : len(row)] = row
         first[k + 1, :8] = first[k, :8] + [*(len(getattr(m, name)) for name in ARRAYS), len(m.phase.S)]
-        first[k + 1, 8:] = first[k, 8:] + [m.detail.noise.size, m.detail.curl.size, *(a.size for a in m.phase.table)]
+        first[k + 1, 8:] = first[k, 8:] + [m.detail.values.size, m.phase.table.values.size]
     empty = [np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0), np.zeros(0)]
     empty += [np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6))]
-    empty += [np.zeros(0, np.float32)] * 2 + [np.zeros(0)] * 3
-    own = [
-        [*(getattr(m, name) for name in ARRAYS), m.phase.S]
-        + [a.ravel() for a in (m.detail.noise, m.detail.curl, *m.phase.table)]
-        for m in media
-    ]
+    empty += [np.zeros(0, np.float32), np.zeros(0)]
+    own = [[*(getattr(m, name) for name in ARRAYS), m.phase.S, m.detail.values, m.phase.table.values] for m in media]
     return Media(numbers, first, *(np.concatenate(a) for a in zip(empty, *own, strict=True)))
 
 
@@ -91,17 +84,7 @@ def medium_at(media, k):
             int(n[35]),
             n[36],
             n[37],
-            Table(
-                media.D[a[10] : b[10]].reshape((int(n[38]), int(n[39]), int(n[40]))),
-                media.sigma[a[11] : b[11]].reshape((int(n[38]), int(n[39]), int(n[40]))),
-                media.cumulative[a[12] : b[12]].reshape((int(n[38]), (int(n[39]) - 1) * int(n[40]))),
-            ),
+            Table(media.flakes[a[9] : b[9]], int(n[38]), int(n[39]), int(n[40])),
         ),
-        Detail(
-            media.noise[a[8] : b[8]].reshape((int(n[33]), int(n[33]), int(n[33]), 1)),
-            media.curl[a[9] : b[9]].reshape((int(n[34]), int(n[34]), 2)),
-            (n[28], n[29], n[30]),
-            n[31],
-            int(n[32]),
-        ),
+        Detail(media.detail[a[8] : b[8]], int(n[33]), int(n[34]), (n[28], n[29], n[30]), n[31], int(n[32])),
     )

@@ -70,8 +70,8 @@ def layer(
     row = np.array([float(tau), *own, *rgb(albedo, "albedo", 1.0), kind, *of[1], *of[2], 0.0])
     if not isinstance(S, microflakes.Table):
         return row
-    if len(S.D) != 1:
-        raise InputError(f"SpongeCake layer: expected one distribution of flakes, got {len(S.D)}")
+    if S.kinds != 1:
+        raise InputError(f"SpongeCake layer: expected one distribution of flakes, got {S.kinds}")
     return Tabulated(row, S)
 
 

@@ -77,7 +77,9 @@ def _medium(m: media.Medium) -> dict[str, object]:
         if m.attributes.size > 1:
             out["attribute"] = media.dense(m._replace(samples=m.attributes))
         if m.detail.octaves:
-            out |= m.detail._asdict()
+            d, size = m.detail, m.detail.n**3
+            out |= {"noise": d.values[:size].reshape((d.n,) * 3), "curl": d.values[size:].reshape(d.p, d.p, 2)}
+            out |= {"tiles": d.tiles, "erosion": d.erosion, "octaves": d.octaves}
     if m.kind == media.EXPONENTIAL:
         out["height"] = 1.0 / m.falloff
     return out

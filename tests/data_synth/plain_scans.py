@@ -13,6 +13,7 @@ from data_synth.integrators import Emission, March, RayCast
 from data_synth.scene import Scene
 from data_synth.scenes.volumes import TISSUE
 
+pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered")  # of uint64, which is meant to wrap
 PEAK = np.array([[0, 0, 1, 0, 0], [0.5, 0, 1, 0, 0], [0.515, 1, 0.8, 0.1, 0.3], [0.53, 0, 0, 1, 0], [1, 0, 0, 0, 1.0]])
 SMOOTH = np.array([[0, 0, 1, 0, 0], [0.3, 0.2, 1, 0.5, 0], [0.6, 0.9, 0, 1, 0.5], [1, 0.1, 0, 0.2, 1.0]])
 SIGMA = 30.0
