@@ -28,7 +28,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from data_synth import channels, clouds, lights, materials, media, phase, scenes, sggx, spongecake, surfaces, volumes
+from data_synth import (
+    channels,
+    clouds,
+    lights,
+    materials,
+    media,
+    microflakes,
+    phase,
+    scenes,
+    sggx,
+    spongecake,
+    surfaces,
+    volumes,
+)
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError
 from data_synth.integrators import INTEGRATORS
@@ -93,6 +106,13 @@ def cloud(
     return media.grid(clouds.cloud(kind, shape, coverage, scale, erosion, seed), lo, hi, sigma_t, albedo, phase=phase)
 
 
+def flakes_of(
+    S: Any, diffuse: bool = False, micro: str | None = None, roughness: float = 0.3, ior: float = 1.5
+) -> phase.Phase:
+    """Microflakes of one distribution: {fibre: ...} or another kind of flakes."""
+    return phase.microflakes(S, diffuse=diffuse, micro=micro, roughness=roughness, ior=ior)
+
+
 def layered(layers: Any) -> Any:
     """A flat sheet of SpongeCake layers, top first."""
     return layers
@@ -104,8 +124,10 @@ KINDS: dict[str, dict[str, Callable]] = {
     )},
     "phase": {f.__name__: f for f in (
         phase.isotropic, phase.rayleigh, phase.henyey_greenstein, phase.two_lobes,
-    )} | {"microflakes": lambda S, diffuse=False: phase.microflakes(S, diffuse=diffuse)},
-    "flakes": {"fibre": sggx.fibre, "surface": sggx.surface, "matrix": lambda S: sggx.check_sggx(S)},
+    )} | {"microflakes": flakes_of},
+    "flakes": {f.__name__: f for f in (
+        sggx.fibre, sggx.surface, microflakes.beckmann, microflakes.ggx, microflakes.trigonometric,
+    )} | {"matrix": lambda S: sggx.check_sggx(S)},
     "material": {f.__name__: f for f in (
         materials.lambert, materials.blinn_phong, materials.dielectric, materials.null, layered,
     )},
@@ -270,9 +292,9 @@ class _File:
             if not isinstance(value, str):
                 raise self.fail(where, f"expected a file name, got {value}")
             return str(self.path.parent / value)
-        if key in ("back", "kind"):
+        if key in ("back", "kind", "micro"):
             return value
-        if key == "diffuse":
+        if key in ("diffuse", "fibre", "schlick"):
             if not isinstance(value, bool):
                 raise self.fail(where, f"expected true or false, got {value}")
             return value
