@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from data_synth.errors import InputError
 
@@ -35,7 +35,8 @@ except ImportError as error:
 OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # No wrappers: compiled code alone calls these functions, and wrapping each of them for Python took a third of the time that
 # compiling takes. To call one from Python say function.py_func(...).
-jit = numba.njit(**OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+jit = numba.njit(**INNER)
 
 
 @cache
