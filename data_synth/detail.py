@@ -82,9 +82,7 @@ def noise_at(d, x, y, z):
     sy = y + push * pushed(curl, CURL_TILES * x, CURL_TILES * y, 1)
     total, weights, finer, weight = 0.0, 0.0, 1.0, 1.0
     for _ in range(d.octaves):
-        total += weight * texture_at(
-            noise, finer * d.tiles[0] * sx, finer * d.tiles[1] * sy, finer * d.tiles[2] * z, 0
-        )
+        total += weight * texture_at(noise, finer * d.tiles[0] * sx, finer * d.tiles[1] * sy, finer * d.tiles[2] * z, 0)
         weights += weight
         finer, weight = FINER * finer, WEAKER * weight
     n, upward = total / weights, min(8.0 * z, 1.0)
