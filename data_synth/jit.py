@@ -35,8 +35,8 @@ except ImportError as error:
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # No wrappers: compiled code alone calls these functions, and wrapping each of them for Python took a third of the time that
 # compiling takes. To call one from Python say function.py_func(...).
-UNWRAPPED: dict[str, Any] = OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-jit = numba.njit(**UNWRAPPED)
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+jit = numba.njit(**INNER)
 
 
 def plain(function: Callable) -> Callable:

@@ -98,12 +98,14 @@ def volume(
 def cloud(
     kind: str = "cumulus", lo: media.Point = (-1.3, -1.3, -0.85), hi: media.Point = (1.3, 1.3, 0.85), resolution: int = 128,
     coverage: float = 0.95, scale: float = 1.0, erosion: float = 0.3, seed: int = 0, sigma_t: Any = 22.0, albedo: Any = 0.995,
-    phase: Any = None,
+    phase: Any = None, detail: int = 0,
 ) -> media.Medium:  # fmt: skip
-    """Clouds out of noise: stratus, cumulus or cumulonimbus."""
+    """Clouds out of noise: stratus, cumulus or cumulonimbus. detail: octaves of erosion below the voxel, 0 for none."""
     extent = surfaces.vector(hi, "hi") - surfaces.vector(lo, "lo")
     shape = tuple(max(int(n), 2) for n in resolution * extent / extent.max())
-    return media.grid(clouds.cloud(kind, shape, coverage, scale, erosion, seed), lo, hi, sigma_t, albedo, phase=phase)
+    rho = clouds.cloud(kind, shape, coverage, scale, 0.0 if detail else erosion, seed)
+    fine = clouds.detail_of(clouds.cloud_textures(seed), scale, erosion, detail) if detail else None
+    return media.grid(rho, lo, hi, sigma_t, albedo, phase=phase, detail=fine)
 
 
 def flakes_of(
