@@ -50,14 +50,12 @@ def attribute(m, p):
 @jit
 def phase_at(m, p):
     """The phase function at a point: the medium's own, or with the g or S that a grid has there."""
-    c, f = m.columns, m.phase
+    c = m.columns
     if c.g >= 0:
-        g = mixed(m.fields, c.width, c.g, cell_at(m, p))
-        return phases.Phase(f.kind, g, f.g2, f.mix, f.S, f.micro, f.roughness, f.ior, f.table, f.own)
+        return phases.with_g(m.phase, mixed(m.fields, c.width, c.g, cell_at(m, p)))
     if c.S >= 0:
-        S = matrix(m, cell_at(m, p))
-        return phases.Phase(f.kind, f.g1, f.g2, f.mix, f.S, f.micro, f.roughness, f.ior, f.table, S)
-    return f
+        return phases.with_S(m.phase, matrix(m, cell_at(m, p)))
+    return m.phase
 
 
 @jit

@@ -113,6 +113,20 @@ def largest_area(phase: Phase) -> float:
 
 
 @jit
+def with_g(phase, g):
+    """The phase function with another g1."""
+    f = phase
+    return Phase(f.kind, g, f.g2, f.mix, f.S, f.micro, f.roughness, f.ior, f.table, f.own)
+
+
+@jit
+def with_S(phase, S):
+    """The phase function with an SGGX matrix of the place, six numbers."""
+    f = phase
+    return Phase(f.kind, f.g1, f.g2, f.mix, f.S, f.micro, f.roughness, f.ior, f.table, S)
+
+
+@jit
 def flakes_at(phase, attribute):
     """The six numbers of S: of the place, else of the nearest row for an attribute in [0, 1]."""
     if phase.own[0] > 0.0:

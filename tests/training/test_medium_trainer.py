@@ -125,6 +125,26 @@ def test_another_seed_is_another_run(scene):
     assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
 
 
+def test_threads_do_not_change_a_bit(scene):
+    """Of a grid and batches large enough that torch shares them out."""
+    import torch
+
+    before, runs = torch.get_num_threads(), []
+    large = MediumConfig(steps=100, resolutions=(32,), stage_ends=(1.0,), rays=2048, lights=1)
+    try:
+        for threads in (1, 2, 3):
+            trainer = trainer_of(scene, large)
+            torch.set_num_threads(threads)
+            trainer.step(0.0)
+            trainer.step(0.01)
+            runs.append(trainer.state_dict())
+    finally:
+        torch.set_num_threads(before)
+    for run in runs[1:]:
+        for name, array in runs[0].items():
+            assert np.array_equal(run[name], array), name
+
+
 def test_white_that_was_cut_off_asks_for_no_less(scene):
     """A model brighter than white, where the picture is white, has no error; one below has."""
     import torch
