@@ -125,7 +125,7 @@ def test_the_fast_ways_leave_it_to_the_others(fine):
     assert gather.possible(Scene(medium=plain, lights=sun).world())
     assert compiled.unknown(Scene(medium=plain, lights=sun).world()) == ""
     for m, why in (
-        (medium(fine), "detail below the grid"),
+        (media.grid(DENSITY, *BOX, detail=fine), "detail below the grid"),
         (media.grid(DENSITY, *BOX, g=BEND), "grids of albedo, Le, g or S"),
     ):
         world = Scene(medium=m, lights=sun).world()
