@@ -22,18 +22,21 @@ if TYPE_CHECKING:
         lights,
         materials,
         media,
+        microflakes,
         phase,
+        raycast,
         scenes,
         sggx,
         spongecake,
         surfaces,
         volumes,
+        weather,
     )  # fmt: skip
     from data_synth.cameras import Camera, Viewpoints, look_at
     from data_synth.dataset import Options, write_dataset
     from data_synth.errors import InputError, RenderWarning
     from data_synth.image import Picture, read_exr, write_exr, write_png
-    from data_synth.integrators import DeepShadow, Emission, March, Path, Preview
+    from data_synth.integrators import DeepShadow, Emission, March, Path, Preview, RayCast
     from data_synth.scene import Scene
     from data_synth.scene_file import load as load_scene
     from data_synth.transmittance import sample_flights, sample_transmittance
@@ -41,18 +44,19 @@ if TYPE_CHECKING:
     from data_synth.views import render_view as render
 
 __all__ = [
-    "Camera", "DeepShadow", "Emission", "InputError", "March", "Options", "Path", "Picture", "Preview", "RenderWarning",
-    "Scene", "Viewpoints", "channels", "clouds", "lights", "load_scene", "look_at", "materials", "media", "phase", "read_exr",
-    "render", "render_view", "sample_flights", "sample_transmittance", "scenes", "sggx", "spongecake", "surfaces",
-    "volumes", "write_dataset", "write_exr", "write_png",
+    "Camera", "DeepShadow", "Emission", "InputError", "March", "Options", "Path", "Picture", "Preview", "RayCast",
+    "RenderWarning", "Scene", "Viewpoints", "channels", "clouds", "lights", "load_scene", "look_at", "materials", "media",
+    "microflakes", "phase", "raycast", "read_exr", "render", "render_view", "sample_flights", "sample_transmittance", "scenes",
+    "sggx", "spongecake", "surfaces", "volumes", "weather", "write_dataset", "write_exr", "write_png",
 ]  # fmt: skip
 
 _HOMES = {
     "Camera": "cameras", "Viewpoints": "cameras", "look_at": "cameras", "Options": "dataset", "render_view": "views",
     "render": "views:render_view", "write_dataset": "dataset", "InputError": "errors", "RenderWarning": "errors",
     "Picture": "image", "read_exr": "image", "write_exr": "image", "write_png": "image", "DeepShadow": "integrators",
-    "Emission": "integrators", "March": "integrators", "Path": "integrators", "Preview": "integrators", "Scene": "scene",
-    "load_scene": "scene_file:load", "sample_flights": "transmittance", "sample_transmittance": "transmittance",
+    "Emission": "integrators", "March": "integrators", "Path": "integrators", "Preview": "integrators",
+    "RayCast": "integrators", "Scene": "scene", "load_scene": "scene_file:load", "sample_flights": "transmittance",
+    "sample_transmittance": "transmittance",
 }  # fmt: skip
 """The module of each name, and its name there where that differs; the rest of ``__all__`` are modules."""
 

@@ -102,7 +102,11 @@ def preview() -> None:
         "| method | CPU s | error | rms | bias | error at the best exposure | correlation |\n|---|---|---|---|---|---|---|"
     )
     row = []
-    for name, method in {"preview": Preview(), "single scattering": DeepShadow()}.items():
+    for name, method in {
+        "preview": Preview(),
+        "soft preview": Preview(soft=True),
+        "single scattering": DeepShadow(),
+    }.items():
         method.render(scene, camera)
         picture = method.render(scene, camera).rgb
         _, cpu = seconds(lambda method=method: method.render(scene, camera), 3)
@@ -118,7 +122,7 @@ def preview() -> None:
     write_png(
         "preview.jpg", np.rint(255 * linear_to_srgb(scene.exposure * np.concatenate(row, axis=1))).astype(np.uint8)
     )
-    print("preview.jpg: preview, single scattering, path tracing")
+    print("preview.jpg: preview, soft preview, single scattering, path tracing")
 
 
 def views() -> None:

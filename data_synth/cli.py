@@ -41,7 +41,10 @@ from data_synth.views import (
     rendered,
 )
 
-OWN = {key: "--" + key.replace("_", "-") for key in ("spp", "max_depth", "beams", "side", "resolution", "fill")}
+OWN = {
+    key: "--" + key.replace("_", "-")
+    for key in ("spp", "max_depth", "beams", "side", "resolution", "fill", "rain", "gradient", "shading")
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -80,6 +83,14 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     p.add_argument("--beams", type=int, metavar="N", help="march, deep: beams that stand for a sky or lamp")
     p.add_argument("--resolution", type=int, metavar="N", help="deep: samples along the longest side of a shadow map")
     p.add_argument("--fill", metavar="HOW", help="deep: sweep, eager or lazy")
+    p.add_argument(
+        "--rain", type=float, metavar="R", help="preview: optical depths of a raining cloud count R-fold (default 2)"
+    )
+    p.add_argument(
+        "--shading", metavar="HOW", help="raycast: none, lambert or phong, by the gradient, with a lamp at the eye"
+    )
+    p.add_argument("--gradient", type=float, metavar="X", help="raycast: opacity grows with the gradient, and is full where a "
+                   "value changes by X of its range from voxel to voxel")  # fmt: skip
     lights = ", ".join(scenes.LIGHTS)
     p.add_argument("--light", metavar="NAME,...", help=f"lights instead of the scene's own: {lights}")
     p.add_argument("--suns", type=int, default=0, metavar="N", help="for relighting: each view under one of N suns, test views "

@@ -1,9 +1,10 @@
 """Cloud densities after [Horizon] (Schneider & Vos 2015), PHYSICS 13.
 
 base   = remap(Perlin-Worley, low-frequency Worley - 1 -> 1, 0 -> 1), its contrast stretched, x height gradient
-shaped = remap(base, 1 - coverage(x, y) -> 1, 0 -> 1) x coverage
-final  = remap(shaped, detail x edge -> 1, 0 -> 1): the detail erodes the edges, wispy below and billowy above,
-and the detail is looked up at a place that curl noise has distorted.
+shape  = remap(base, 1 - coverage -> 1.3 - coverage, 0 -> 1)
+final  = the shape eroded by finer noise (``detail.py``): once, at the samples of a grid, or wherever a ray asks for it
+
+Coverage and type come from a single cloud's footprint, or over a landscape from a weather map (``weather.py``).
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from data_synth import detail as details
+from data_synth.detail import Detail, eroded
 from data_synth.errors import InputError
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.noise import CloudTextures, cloud_textures, remap, texture_at
 
 STRATUS, CUMULUS, CUMULONIMBUS = range(3)
+DETAIL_TILES = 5.0  # of the detail noise for one of the base noise
 TYPES = {"stratus": STRATUS, "cumulus": CUMULUS, "cumulonimbus": CUMULONIMBUS}
 
 
@@ -45,57 +49,51 @@ def footprint(kind, x, y, h, coverage):
 
 
 @jit
-def cloud_density(t, kind, coverage, frequency, erosion, x, y, z):
-    """Cloud fraction in [0, 1] at a point of the unit cube."""
-    gradient = height_gradient(kind, z)
-    cover = footprint(kind, x, y, z, coverage)
+def shape_at(t, gradient, cover, x, y, z):
+    """The cloud's shape in [0, 1]; x, y, z in tiles of the base noise."""
     if gradient <= 0.0 or cover <= 0.0:
         return 0.0
-    f = frequency
     low = (
-        0.625 * texture_at(t.base, f * x, f * y, f * z, 1)
-        + 0.25 * texture_at(t.base, f * x, f * y, f * z, 2)
-        + 0.125 * texture_at(t.base, f * x, f * y, f * z, 3)
+        0.625 * texture_at(t.base, x, y, z, 1)
+        + 0.25 * texture_at(t.base, x, y, z, 2)
+        + 0.125 * texture_at(t.base, x, y, z, 3)
     )
-    base = remap(texture_at(t.base, f * x, f * y, f * z, 0), low - 1.0, 1.0, 0.0, 1.0)
+    base = remap(texture_at(t.base, x, y, z, 0), low - 1.0, 1.0, 0.0, 1.0)
     base = remap(base, 0.52, 0.92, 0.0, 1.0) * gradient
-    shaped = remap(base, 1.0 - cover, 1.3 - cover, 0.0, 1.0)
-    if shaped <= 0.0:
-        return 0.0
-    n = t.curl.shape[0]
-    i, j = int(4.0 * x * n) % n, int(4.0 * y * n) % n
-    sx, sy = 0.02 * (1.0 - z) * t.curl[i, j, 0], 0.02 * (1.0 - z) * t.curl[i, j, 1]
-    g = 5.0 * f
-    detail = (
-        0.625 * texture_at(t.detail, g * (x + sx), g * (y + sy), g * z, 0)
-        + 0.25 * texture_at(t.detail, g * (x + sx), g * (y + sy), g * z, 1)
-        + 0.125 * texture_at(t.detail, g * (x + sx), g * (y + sy), g * z, 2)
-    )
-    upward = min(8.0 * z, 1.0)
-    edge = detail * (1.0 - upward) + (1.0 - detail) * upward
-    return remap(shaped, erosion * edge, 1.0, 0.0, 1.0)
+    return remap(base, 1.0 - cover, 1.3 - cover, 0.0, 1.0)
 
 
 @kernel
-def _fill(t, kind, coverage, frequency, erosion, out, first, last):
+def _fill(t, detail, kind, coverage, frequency, out, first, last):
     nx, ny, nz = out.shape
     for i in range(first, last):
         for j in range(ny):
             for k in range(nz):
                 x, y, z = i / (nx - 1), j / (ny - 1), k / (nz - 1)
-                out[i, j, k] = cloud_density(t, kind, coverage, frequency, erosion, x, y, z)
+                gradient, cover = height_gradient(kind, z), footprint(kind, x, y, z, coverage)
+                shape = shape_at(t, gradient, cover, frequency * x, frequency * y, frequency * z)
+                out[i, j, k] = eroded(detail, shape, x, y, z)
 
 
 def cloud(
     kind: str, shape: Sequence[int], coverage: float = 0.8, frequency: float = 1.0, erosion: float = 0.3, seed: int = 0,
     textures: CloudTextures | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """(nx, ny, nz) float32 cloud fraction in [0, 1]. kind: stratus, cumulus or cumulonimbus; coverage in [0, 1]."""
+    """(nx, ny, nz) float32 cloud fraction in [0, 1]. kind: stratus, cumulus or cumulonimbus; coverage in [0, 1].
+
+    erosion: by detail noise, in [0, 1); 0 leaves the bare shape, for a medium that erodes it on a ray's way (``detail_of``).
+    """
     if kind not in TYPES:
         raise InputError(f"cloud: type must be one of {', '.join(TYPES)}, got '{kind}'")
     if not 0 <= coverage <= 1:
         raise InputError(f"cloud: coverage must be in [0, 1], got {coverage}")
     out = np.empty(tuple(shape), np.float32)
     t = textures or cloud_textures(seed)
-    in_bands(lambda a, b: _fill(t, TYPES[kind], coverage, frequency, erosion, out, a, b), out.shape[0], 4)
+    d = detail_of(t, frequency, erosion)
+    in_bands(lambda a, b: _fill(t, d, TYPES[kind], coverage, frequency, out, a, b), out.shape[0], 4)
     return out
+
+
+def detail_of(textures: CloudTextures, frequency: float = 1.0, erosion: float = 0.3, octaves: int = 1) -> Detail:
+    """The detail of :func:`cloud`, to be evaluated on the way: ``media.grid(cloud(..., erosion=0), ..., detail=...)``."""
+    return details.detail(textures, (DETAIL_TILES * frequency,) * 3, erosion, octaves)

@@ -53,6 +53,8 @@ def unknown(w: World) -> str:
         return "a density function"
     if m.columns.width:
         return "grids of albedo, Le, g or S"
+    if m.detail.octaves > 0:
+        return "detail below the grid"
     if m.phase.kind not in PHASES:
         return "microflakes"
     if max(abs(m.phase.g1), abs(m.phase.g2)) > MOST_FORWARD:

@@ -12,7 +12,7 @@ import math
 from data_synth import phase
 from data_synth.jit import jit
 from data_synth.lights import POINT, column3
-from data_synth.media import albedo_at, attribute, extinction, phase_at
+from data_synth.lookups import albedo_at, attribute, extinction, phase_at
 from data_synth.rng import uniform
 from data_synth.trackers import shadow_transmittance
 from data_synth.vec import along, dot, extent, largest, mul, neg, scale, sub

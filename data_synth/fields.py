@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from data_synth.bricks import Sparse, cut_to
 from data_synth.errors import InputError
 from data_synth.jit import jit
+from data_synth.sggx import matrices
 from data_synth.vec import trilinear
 
 ROUNDING = 2.0**-23
@@ -96,11 +97,6 @@ def _checked(name: str, values: np.ndarray) -> np.ndarray:
     if not inside or (name == "g" and values.size and np.abs(values).max() >= 1):
         raise InputError(f"medium: {name} must be {span} at every sample")
     return values
-
-
-def matrices(s: np.ndarray) -> np.ndarray:
-    """(..., 6) as (..., 3, 3)."""
-    return s[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(*s.shape[:-1], 3, 3)
 
 
 def _largest_area(part: np.ndarray) -> float:

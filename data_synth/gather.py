@@ -8,8 +8,8 @@ the next, so that once per view all of J is put down there next to rho, and a ma
 however many beams there are.
 
 An approximation: J is linear between samples. Its error falls with the square of the cell, at a shadow's edge with the
-cell. Not gathered are coloured extinction, microflakes, a grid of g, media that fill boundary surfaces, and lights at a finite
-distance.
+cell. Not gathered are coloured extinction, microflakes, a grid of g, detail below the grid, media that fill boundary
+surfaces, and lights at a finite distance.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from data_synth.cameras import pixel_ray
 from data_synth.fields import at_sample
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
-from data_synth.media import BRICK, GRID, Medium, box_interval, lookup, triple
+from data_synth.lookups import box_interval, lookup
+from data_synth.media import BRICK, GRID, Medium, triple
 from data_synth.rng import new_rng
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, mul, sub, unit
@@ -51,7 +52,8 @@ def possible(w: World) -> bool:
     grey = m.sigma_t[0] == m.sigma_t[1] == m.sigma_t[2]
     distant = bool(np.all(w.lights[:, 0] == DIRECTIONAL))
     one_phase = m.phase.kind < phases.SGGX_SPECULAR and m.columns.g < 0
-    return m.kind == GRID and grey and distant and one_phase and not has_boundaries(w) and not is_large(m)
+    samples = m.kind == GRID and m.detail.octaves == 0 and not is_large(m)
+    return samples and grey and distant and one_phase and not has_boundaries(w)
 
 
 def outside(m: Medium, eye: np.ndarray) -> bool:
@@ -185,7 +187,7 @@ def trilinear(v, a, fu, fv, fw):
 
 @jit
 def look_up(m, v, p):
-    """(rho, J rgb) at a point: ``media.interpolated`` of four numbers at a time."""
+    """(rho, J rgb) at a point: ``lookups.interpolated`` of four numbers at a time."""
     a, fu, fv, fw = place(m, p)
     return trilinear(v, a, fu, fv, fw)
 

@@ -9,6 +9,7 @@
 | deep     | single scattering, deep shadow maps               | DeepShadow |
 | path     | all orders of scattering, Monte Carlo             | Path       |
 | preview  | the look of a cloud [Horizon]: an approximation   | Preview    |
+| raycast  | a scan through its transfer function              | RayCast    |
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from data_synth import channels, compiled, gather, march, parts, path, shadowmap
+from data_synth import channels, compiled, gather, march, parts, path, raycast, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
 from data_synth.functions import say_faults
 from data_synth.gather import Gathered
 from data_synth.image import Picture
 from data_synth.jit import in_bands
+from data_synth.media import Medium, glows
 from data_synth.parts import Part
 from data_synth.rng import new_rng
 from data_synth.shadowmap import ShadowMaps
@@ -89,7 +91,8 @@ class March:
             if not gather.outside(world.medium, eye):
                 return replace(self, resolution=MAP_RESOLUTION).sums(scene, camera, seed, part)
             mode, rho_J = march.GATHERED, gather.towards(world, gathered, eye)
-        lighting = march.Lighting(mode, maps, rho_J)
+        own = (float(self.rain), self.soft) if isinstance(self, Preview) else (1.0, False)
+        lighting = march.Lighting(mode, maps, rho_J, *own)
         out, data = np.empty((camera.height, camera.width, 5)), camera.data()
 
         def rows(first: int, last: int) -> None:
@@ -109,16 +112,70 @@ class March:
 
 @dataclass(frozen=True)
 class Emission(March):
-    """Emission and absorption alone."""
+    """Emission and absorption alone; of a scan where nothing glows, the colours of its transfer function, as ``RayCast``."""
 
     mode: int = field(default=march.UNLIT, repr=False)
+
+    def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
+        """See Integrator; rgb, alpha, distance."""
+        if scene.classified is not None and not (isinstance(scene.medium, Medium) and glows(scene.medium)):
+            return RayCast(side=self.side).sums(scene, camera, seed, part)
+        return super().sums(scene, camera, seed, part)
+
+
+@dataclass(frozen=True)
+class RayCast(March):
+    """A scan as viewers show it (``raycast.py``): emission and absorption, classified after interpolation, and nothing else.
+
+    integrated: by the pre-integrated table, else at the midpoints of steps. gradient: change of the value from voxel to voxel,
+    of its range, at which opacity is full; 0: opacity alone counts. shading: none, lambert or phong, with a lamp at the eye.
+    """
+
+    integrated: bool = True
+    gradient: float = 0.0
+    shading: str = "none"
+    mode: int = field(default=march.UNLIT, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        raycast.check(self.gradient, self.shading)
+
+    def sums(self, scene: Scene, camera: Camera, seed: int, part: Part) -> np.ndarray:
+        """See Integrator; rgb, alpha, distance."""
+        if scene.classified is None:
+            raise InputError(f"--integrator raycast: scene {scene.name} has no transfer function")
+        key, scan = (self, id(scene.classified)), scene.classified
+        if key not in _tables:
+            _tables.clear()
+            _tables[key] = scan, raycast.table_of(scan, self.integrated, self.gradient, self.shading)
+        table, out, data = _tables[key][1], np.empty((camera.height, camera.width, 5)), camera.data()
+
+        def rows(first: int, last: int) -> None:
+            raycast.render_rows(scan.values, table, data, self.side, out, first, last)
+
+        return _banded(rows, out, part, 4)
+
+
+_tables: dict[
+    tuple[RayCast, int], tuple[raycast.Classified, raycast.Table]
+] = {}  # of the last scan, which it keeps alive
 
 
 @dataclass(frozen=True)
 class Preview(March):
-    """The Horizon-style cloud preview: an approximation that stands next to the answers of the others."""
+    """The Horizon-style cloud preview, 2 e^-(d r) HG powder: an approximation that stands next to the answers of the others.
 
+    rain: r where it pours (the medium's attribute is 1); it is 1 where it is dry. soft: with floors under e^-d and powder.
+    """
+
+    rain: float = 2.0
+    soft: bool = False
     mode: int = field(default=march.PREVIEW, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.rain < np.inf:
+            raise InputError(f"--rain: expected a number from 0 on, got {self.rain}")
 
 
 @dataclass(frozen=True)
@@ -219,6 +276,7 @@ def _say_faults(world: World) -> None:
 
 INTEGRATORS: dict[str, Callable[..., Integrator]] = {
     "emission": Emission, "march": March, "deep": DeepShadow, "path": Path, "preview": Preview,
+    "raycast": RayCast,
 }  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from data_synth.errors import InputError
 
@@ -32,8 +32,11 @@ except ImportError as error:
 # error_model="numpy": x/0 is inf as in IEEE 754, no exception branch behind every division.
 # _nrt=False: no array is ever made inside compiled code, so none needs its references counted. Counting them, with
 # atomic operations at every call that passes a scene along, took most of the time.
-OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
-jit = numba.njit(**OPTIONS)
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+# No wrappers: compiled code alone calls these functions, and wrapping each of them for Python took a third of the time that
+# compiling takes. To call one from Python say function.py_func(...).
+INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+jit = numba.njit(**INNER)
 
 
 def plain(function: Callable) -> Callable:

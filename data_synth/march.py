@@ -21,8 +21,8 @@ from data_synth.cameras import pixel_ray
 from data_synth.gather import OPAQUE, Clear, march_gathered
 from data_synth.jit import jit, kernel
 from data_synth.lights import escaped, quad_radiance, sample_light
+from data_synth.lookups import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE
-from data_synth.media import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.rng import reseed
 from data_synth.shadowmap import ShadowMaps, look_up
 from data_synth.spongecake import attenuation
@@ -45,11 +45,14 @@ NEAR = 1.0 - 1e-9  # of the distance to a light, so that a lamp is not in the wa
 
 
 class Lighting(NamedTuple):
-    """Where light in the medium comes from: a mode above, and what it reads. rho_J: of ``gather.towards``."""
+    """Where light in the medium comes from: a mode above, and what it reads. rho_J: of ``gather.towards``. rain, soft: of the
+    preview."""
 
     mode: int
     maps: ShadowMaps
     rho_J: np.ndarray
+    rain: float = 1.0
+    soft: bool = False
 
 
 class Seen(NamedTuple):
@@ -70,9 +73,19 @@ class Step(NamedTuple):
 
 
 @jit
-def preview_source(m, p, wi, wo, a, rng):
-    """[Horizon] an approximation, not a solution: energy = 2 e^-d f_HG powder, powder = 1 - e^-2d, with floors to both:
-    e^-d is at least 0.7 e^(-d/4), and powder 1 - e^(-2d - 1/2), so that a cloud's rim and depth do not go black.
+def preview_energy(d, r, soft):
+    """[Horizon] 2 e^-(d r) powder, powder = 1 - e^-2d: what the look of a cloud makes of the optical depth d towards the sun.
+
+    soft: e^-(d r) is at least 0.7 e^-(d r / 4), and powder is 1 - e^-(2d + 1/2), so that rim and depth do not go black.
+    """
+    if soft:
+        return 2.0 * max(math.exp(-d * r), 0.7 * math.exp(-0.25 * d * r)) * (1.0 - math.exp(-2.0 * d - 0.5))
+    return 2.0 * math.exp(-d * r) * (1.0 - math.exp(-2.0 * d))
+
+
+@jit
+def preview_source(m, p, wi, wo, a, lighting, rng):
+    """An approximation, not a solution: ``preview_energy`` times f_HG; r grows with the attribute, a cloud's precipitation.
 
     d is the optical depth of six samples towards the sun, spread over a third of the medium's height.
     """
@@ -85,9 +98,8 @@ def preview_source(m, p, wi, wo, a, rng):
         inside = m.lo[0] <= q[0] <= m.hi[0] and m.lo[1] <= q[1] <= m.hi[1] and m.lo[2] <= q[2] <= m.hi[2]
         if inside:
             d += width * extinction(m, q, wi) * m.sigma_t[1]
-    beer = max(math.exp(-d), 0.7 * math.exp(-0.25 * d))
-    powder = 1.0 - math.exp(-2.0 * d - 0.5)
-    return 2.0 * beer * powder * phase.evaluate(phase_at(m, p), a, wo, wi, rng)
+    r = 1.0 + (lighting.rain - 1.0) * a
+    return preview_energy(d, r, lighting.soft) * phase.evaluate(phase_at(m, p), a, wo, wi, rng)
 
 
 @jit
@@ -99,7 +111,7 @@ def scattered_light(w, m, p, wo, a, step, rng):
         if largest(radiance) <= 0.0:
             continue
         if mode == PREVIEW:
-            total = add(total, scale(preview_source(m, p, wi, wo, a, rng), radiance))
+            total = add(total, scale(preview_source(m, p, wi, wo, a, step.lighting, rng), radiance))
             continue
         if mode == MAPPED and step.number == 0:
             shadow = look_up(step.lighting.maps, w, k, p, rng)

@@ -29,7 +29,7 @@ CLEAR, UNSAID = -1, -2  # no medium inside; the scene decides
 
 class Materials(NamedTuple):
     rows: np.ndarray
-    layers: np.ndarray
+    layers: spongecake.Layers
 
 
 def lambert(albedo: ArrayLike, second: ArrayLike | None = None, square: float = 0.0) -> np.ndarray:

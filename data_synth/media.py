@@ -1,4 +1,4 @@
-"""Participating media (PHYSICS 5): where the coefficients are, and how a kernel looks them up.
+"""Participating media (PHYSICS 5): where the coefficients are. ``lookups.py`` reads them.
 
 A medium has a dimensionless density rho(x) >= 0, constant RGB extinction per density sigma_t in 1/u, and RGB albedo and
 emitted radiance Le that may depend on a second field, the *attribute* in [0, 1] (a temperature, a tissue, a thread), or
@@ -20,15 +20,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth import detail as details
 from data_synth import phase as phases
 from data_synth.bricks import BRICK, SIDE, Sparse, bricks, cut_to
 from data_synth.checks import vector
 from data_synth.errors import InputError
-from data_synth.fields import NOTHING, Columns, Given, cell_at, colour, is_grid, matrices, matrix, mixed, stored
-from data_synth.functions import address_of, bounded
-from data_synth.jit import jit
-from data_synth.sggx import projected_area
-from data_synth.vec import slab
+from data_synth.fields import NOTHING, Columns, Given, is_grid, stored
+from data_synth.functions import address_of
 
 Point = Sequence[float] | np.ndarray
 HOMOGENEOUS, GRID, EXPONENTIAL, FUNCTION = range(4)
@@ -41,7 +39,8 @@ class Medium(NamedTuple):
     of a brick or -1; samples, attributes: float32; brick_max, brick_min: (bricks,) bounds of the density; sigma_t: RGB
     per density; albedo, Le: (K, 3) tables over the attribute; base, falloff: of the exponential; step: length of a
     marching step in u; flake_area: largest projected area of the microflakes (1 without). fields, columns: the samples of
-    ``fields.py``. function: address of a density function (``functions.py``); faults: (3,) what is wrong with it.
+    ``fields.py``. function: address of a density function (``functions.py``); faults: (3,) what is wrong with it. detail: of a
+    cloud, finer than the grid.
     """
 
     kind: int
@@ -68,6 +67,7 @@ class Medium(NamedTuple):
     columns: Columns
     function: int
     faults: np.ndarray
+    detail: details.Detail
 
 
 def triple(values: Iterable[float]) -> tuple[float, float, float]:
@@ -119,12 +119,14 @@ def grid(
     density: ArrayLike | Sparse, lo: Point, hi: Point, sigma_t: ArrayLike = 1.0, albedo: ArrayLike | Sparse = 0.0,
     Le: ArrayLike | Sparse = 0.0, phase: phases.Phase | None = None, attribute: ArrayLike | Sparse | None = None,
     majorant: float | None = None, g: ArrayLike | Sparse | None = None, S: ArrayLike | None = None,
+    detail: details.Detail | None = None,
 ) -> Medium:  # fmt: skip
     """A heterogeneous medium of (nx, ny, nz) density samples at the vertices of a regular grid from lo to hi.
 
     attribute: same shape, in [0, 1]. albedo, Le: a colour, a table of colours over the attribute, or grids of the density's
     shape or with three channels. g: a grid of mean cosines, of the first lobe if ``phase`` has two. S: (nx, ny, nz, 6) SGGX
-    matrices. majorant: an upper bound the caller believes in; lower is an error.
+    matrices. majorant: an upper bound the caller believes in; lower is an error. detail: noise that erodes the density, in
+    [0, 1] then, wherever it is asked for (``detail.py``); z is up.
     """
     density = density if isinstance(density, Sparse) else np.asarray(density)
     if len(density.shape) != 3 or min(density.shape) < 2:
@@ -146,10 +148,19 @@ def grid(
     cells = (nx - 1, ny - 1, nz - 1)
     medium = _medium(GRID, lo, hi, cells, (b.top, b.bottom), sigma_t, table, glow, phase)
     attributes = np.zeros(1, np.float32) if attribute is None else cut_to(attribute, b.kept).astype(np.float32).ravel()
-    return medium._replace(
+    medium = medium._replace(
         offsets=b.offsets, samples=b.samples, attributes=attributes, fields=fields, columns=columns,
         flake_area=area if S is not None else medium.flake_area,
     )  # fmt: skip
+    return medium if detail is None else _detailed(medium, detail)
+
+
+def _detailed(m: Medium, d: details.Detail) -> Medium:
+    """The medium eroded by detail, marched in steps of two samples of the finest noise, at the least a cell's eighth."""
+    if m.max_density > 1:
+        raise InputError(f"medium: a density with detail must be in [0, 1], got {m.max_density:g}")
+    sizes = [2 * (b - a) / n for a, b, n in zip(m.lo, m.hi, details.finest(d), strict=True)]
+    return m._replace(detail=d, brick_min=details.least(d, m.brick_min), step=min(m.step, max(min(sizes), m.step / 8)))
 
 
 def _varying(phase: phases.Phase | None, g: bool, S: bool) -> phases.Phase | None:
@@ -158,8 +169,8 @@ def _varying(phase: phases.Phase | None, g: bool, S: bool) -> phases.Phase | Non
         raise InputError("medium: expected a grid of g or of S, got both")
     if S:
         phase = phase or phases.microflakes(np.eye(3))
-        if phase.kind not in (phases.SGGX_SPECULAR, phases.SGGX_DIFFUSE):
-            raise InputError("medium: a grid of S belongs to microflakes, got another phase function")
+        if phase.kind < phases.SGGX_SPECULAR or phase.table.kinds:
+            raise InputError("medium: a grid of S belongs to SGGX microflakes, got another phase function")
     if g:
         phase = phase or phases.henyey_greenstein(0.0)
         if phase.kind != phases.HG:
@@ -208,7 +219,7 @@ def _medium(
     if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"medium: expected a box with lo < hi, got {lo} and {hi}")
     phase = phase or phases.isotropic()
-    area = math.sqrt(np.linalg.eigvalsh(matrices(phase.S))[:, -1].max())
+    area = phases.largest_area(phase)
     cell = triple((b - a) / n for a, b, n in zip(lo, hi, cells, strict=True))
     nx, ny, nz = (-(-n // BRICK) for n in cells) if kind == GRID else cells
     step = min(cell) if kind == GRID else max(b - a for a, b in zip(lo, hi, strict=True)) / 128
@@ -217,7 +228,7 @@ def _medium(
         np.zeros(1, np.int64), np.zeros(1, np.float32), np.zeros(1, np.float32),
         np.ascontiguousarray(bounds[0], dtype=float), np.ascontiguousarray(bounds[1], dtype=float),
         float(np.max(bounds[0], initial=0.0)), rgb(sigma_t, "sigma_t"), _table(albedo, "albedo", 1.0),
-        _table(Le, "Le"), 0.0, 0.0, step, area, phase, np.zeros(1, np.float32), NOTHING, 0, np.zeros(3),
+        _table(Le, "Le"), 0.0, 0.0, step, area, phase, np.zeros(1, np.float32), NOTHING, 0, np.zeros(3), details.NONE,
     )  # fmt: skip
 
 
@@ -227,7 +238,7 @@ def glows(m: Medium) -> bool:
 
 
 def dense(m: Medium) -> np.ndarray:
-    """The (nx, ny, nz) float32 density samples of a grid medium, the truth to compare a reconstruction with."""
+    """The (nx, ny, nz) float32 density samples of a grid medium, without its detail."""
     return dense_of(m, m.samples)[..., 0]
 
 
@@ -243,83 +254,3 @@ def dense_of(m: Medium, samples: np.ndarray, first: int = 0, columns: int = 1) -
         -1, *side, columns
     )  # neighbours agree where they overlap
     return out[: m.cells[0] + 1, : m.cells[1] + 1, : m.cells[2] + 1]
-
-
-@jit
-def interpolated(m, values, p):
-    """Interpolate brick samples ``values`` at p, 0 outside the stored bricks."""
-    return mixed(values, 1, 0, cell_at(m, p))
-
-
-@jit
-def density(m, p):
-    """rho at a point inside the box."""
-    if m.kind == GRID:
-        return interpolated(m, m.samples, p)
-    if m.kind == EXPONENTIAL:
-        return math.exp(-(p[2] - m.base) * m.falloff)
-    if m.kind == FUNCTION:
-        return bounded(m, p)
-    return 1.0
-
-
-@jit
-def attribute(m, p):
-    """The attribute at a point, 0 for media that have none."""
-    return interpolated(m, m.attributes, p) if m.attributes.size > 1 else 0.0
-
-
-@jit
-def phase_at(m, p):
-    """The phase function at a point: the medium's own, or with the g or S that a grid has there."""
-    c = m.columns
-    if c.g >= 0:
-        return phases.with_g(m.phase, mixed(m.fields, c.width, c.g, cell_at(m, p)))
-    if c.S >= 0:
-        return phases.with_S(m.phase, matrix(m, cell_at(m, p)))
-    return m.phase
-
-
-@jit
-def albedo_at(m, p, a):
-    """RGB albedo at a point with attribute a."""
-    c = m.columns
-    return colour(m, c.albedo, c.albedo_step, cell_at(m, p)) if c.albedo >= 0 else lookup(m.albedo, a)
-
-
-@jit
-def Le_at(m, p, a):
-    """RGB emitted radiance at a point with attribute a."""
-    c = m.columns
-    return colour(m, c.Le, c.Le_step, cell_at(m, p)) if c.Le >= 0 else lookup(m.Le, a)
-
-
-@jit
-def extinction(m, p, d):
-    """rho at p, times the projected area of microflakes towards d: sigma_t(x, d) / sigma_t."""
-    rho = density(m, p)
-    if m.phase.kind >= phases.SGGX_SPECULAR and rho > 0.0:
-        rho *= projected_area(phases.flakes_at(phase_at(m, p), attribute(m, p)), d)
-    return rho
-
-
-@jit
-def lookup(table, a):
-    """Row of a (K, 3) table at a in [0, 1], linear in between."""
-    n = table.shape[0]
-    if n == 1:
-        return (table[0, 0], table[0, 1], table[0, 2])
-    x = min(max(a, 0.0), 1.0) * (n - 1)
-    i = min(int(x), n - 2)
-    f = x - i
-    return (
-        table[i, 0] + f * (table[i + 1, 0] - table[i, 0]),
-        table[i, 1] + f * (table[i + 1, 1] - table[i, 1]),
-        table[i, 2] + f * (table[i + 1, 2] - table[i, 2]),
-    )
-
-
-@jit
-def box_interval(ray, lo, hi):
-    """(t0, t1) of a ray inside a box with t0 >= 0; t0 > t1 if it misses."""
-    return slab(ray, lo, hi, 0.0, math.inf)

@@ -18,8 +18,8 @@ from data_synth import equiangular, materials, phase, rough
 from data_synth.cameras import pixel_ray
 from data_synth.jit import jit, kernel
 from data_synth.lights import POINT, column3, escaped, quad_pdf, quad_radiance, sample_light
+from data_synth.lookups import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.materials import DIELECTRIC
-from data_synth.media import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.parts import BLOCK
 from data_synth.rng import reseed, uniform
 from data_synth.traverse import collisions, traversal
@@ -110,7 +110,7 @@ def next_event(w, v, inside, beta, rng):
         m = medium_of(w, v.number)
         value = phase.evaluate(phase_at(m, v.p), attribute(m, v.p), v.wo, wi, rng)
         f = (value, value, value)
-        pdf_other = value if m.phase.kind != phase.SGGX_DIFFUSE else 0.0
+        pdf_other = value if phase.has_density(m.phase) else 0.0
         if w.lights[k, 0] == POINT:
             sigma = extinction(m, v.p, v.ray[1]) * largest(m.sigma_t)
             placed = equiangular.density(v.ray, v.t0, v.t1, column3(w.lights, k, 7), v.t)
@@ -216,7 +216,7 @@ def scatter_direction(w, v, rng):
     m = medium_of(w, v.number)
     ph, a = phase_at(m, v.p), attribute(m, v.p)
     wi = phase.sample(ph, a, v.wo, rng)
-    known = ph.kind != phase.SGGX_DIFFUSE
+    known = phase.has_density(ph)
     return wi, (1.0, 1.0, 1.0), phase.evaluate(ph, a, v.wo, wi, rng) if known else UNKNOWN, False
 
 

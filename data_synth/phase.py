@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_synth import microflakes as flakes
 from data_synth import sggx
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.rng import uniform
 from data_synth.vec import dot, neg, sphere_direction
 
-ISOTROPIC, RAYLEIGH, HG, SGGX_SPECULAR, SGGX_DIFFUSE = range(5)
+ISOTROPIC, RAYLEIGH, HG, SGGX_SPECULAR, SGGX_DIFFUSE, FLAKES = range(6)  # from SGGX_SPECULAR on, microflakes
 NO_OWN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -26,7 +27,9 @@ class Phase(NamedTuple):
     """A phase function. Make it with the functions below.
 
     g1, g2: mean cosines of the two Henyey-Greenstein lobes; mix: weight of the first. S: (K, 6) SGGX matrices, one per
-    value of the medium's attribute. own: the matrix of the place instead, of media that have a grid (``media.phase_at``).
+    value of the medium's attribute. Of other microflakes (FLAKES): micro, roughness, ior: what a flake does with light
+    (``microflakes.py``); table: their distributions, none for SGGX. own: the SGGX matrix of the place instead of S, of media
+    that have a grid (``lookups.phase_at``).
     """
 
     kind: int
@@ -34,20 +37,28 @@ class Phase(NamedTuple):
     g2: float
     mix: float
     S: np.ndarray
+    micro: int
+    roughness: float
+    ior: float
+    table: flakes.Table
     own: tuple[float, float, float, float, float, float] = NO_OWN
 
 
 _NO_FLAKES = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]])
 
 
+def _of_angle(kind: int, g1: float = 0.0, g2: float = 0.0, mix: float = 1.0) -> Phase:
+    return Phase(kind, g1, g2, mix, _NO_FLAKES, flakes.SPECULAR, 0.0, 1.0, flakes.EMPTY)
+
+
 def isotropic() -> Phase:
     """1 / 4 pi."""
-    return Phase(ISOTROPIC, 0.0, 0.0, 1.0, _NO_FLAKES)
+    return _of_angle(ISOTROPIC)
 
 
 def rayleigh() -> Phase:
     """3/(16 pi) (1 + cos^2 theta): particles much smaller than the wavelength."""
-    return Phase(RAYLEIGH, 0.0, 0.0, 1.0, _NO_FLAKES)
+    return _of_angle(RAYLEIGH)
 
 
 def henyey_greenstein(g: float) -> Phase:
@@ -62,27 +73,57 @@ def two_lobes(g1: float, g2: float, mix: float) -> Phase:
             raise InputError(f"phase: {name} must be in (-1, 1), got {g}")
     if not 0 <= mix <= 1:
         raise InputError(f"phase: mix must be in [0, 1], got {mix}")
-    return Phase(HG, float(g1), float(g2), float(mix), _NO_FLAKES)
+    return _of_angle(HG, float(g1), float(g2), float(mix))
 
 
-def microflakes(*S: ArrayLike, diffuse: bool = False) -> Phase:
-    """SGGX microflakes, specular by default. S: one or more 3x3 matrices or rows of six numbers (``sggx.fibre``)."""
+def microflakes(
+    *S: ArrayLike | flakes.Table, diffuse: bool = False, micro: str | None = None, roughness: float = 0.3, ior: float = 1.5
+) -> Phase:  # fmt: skip
+    """Microflakes of one distribution per value of the attribute, specular by default.
+
+    S: of SGGX, 3x3 matrices or rows of six numbers (``sggx.fibre``); or tables (``microflakes.beckmann``, ``tabulated``).
+    micro: specular, diffuse, glossy (roughness) or refractive (roughness, ior); diffuse=True is short for that.
+    """
+    micro = micro or ("diffuse" if diffuse else "specular")
+    if micro not in flakes.MICRO:
+        raise InputError(f"microflakes: micro must be one of {', '.join(flakes.MICRO)}, got {micro}")
+    if not 0 < roughness <= 1:
+        raise InputError(f"microflakes: roughness must be in (0, 1], got {roughness}")
+    if not 1 <= ior <= 10:
+        raise InputError(f"microflakes: ior must be from 1 to 10, got {ior}")
+    tables = [s for s in S if isinstance(s, flakes.Table)]
+    if tables and len(tables) < len(S):
+        raise InputError("microflakes: expected either SGGX matrices or tables, got both")
     rows = []
-    for s in (np.asarray(s, dtype=np.float64) for s in S):
-        rows.append(sggx.check_sggx(s if s.shape == (3, 3) else s[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3)))
-    return Phase(SGGX_DIFFUSE if diffuse else SGGX_SPECULAR, 0.0, 0.0, 1.0, np.stack(rows))
+    for s in (np.asarray(s, dtype=np.float64) for s in S if not isinstance(s, flakes.Table)):
+        rows.append(sggx.check_sggx(s if s.shape == (3, 3) else sggx.matrices(s)))
+    kind = FLAKES
+    if not tables and micro in ("specular", "diffuse"):
+        kind = SGGX_DIFFUSE if micro == "diffuse" else SGGX_SPECULAR
+    S_rows = np.stack(rows) if rows else _NO_FLAKES
+    table = flakes.together(tables)
+    return Phase(kind, 0.0, 0.0, 1.0, S_rows, flakes.MICRO[micro], float(roughness), float(ior), table)
+
+
+def largest_area(phase: Phase) -> float:
+    """The largest projected area of the flakes, 1 without: a factor of majorants."""
+    if phase.table.kinds:
+        return float(phase.table.sigma.max())
+    return math.sqrt(np.linalg.eigvalsh(sggx.matrices(phase.S))[:, -1].max())
 
 
 @jit
 def with_g(phase, g):
     """The phase function with another g1."""
-    return Phase(phase.kind, g, phase.g2, phase.mix, phase.S, phase.own)
+    f = phase
+    return Phase(f.kind, g, f.g2, f.mix, f.S, f.micro, f.roughness, f.ior, f.table, f.own)
 
 
 @jit
 def with_S(phase, S):
     """The phase function with an SGGX matrix of the place, six numbers."""
-    return Phase(phase.kind, phase.g1, phase.g2, phase.mix, phase.S, S)
+    f = phase
+    return Phase(f.kind, f.g1, f.g2, f.mix, f.S, f.micro, f.roughness, f.ior, f.table, S)
 
 
 @jit
@@ -94,6 +135,28 @@ def flakes_at(phase, attribute):
     k = min(max(int(attribute * (n - 1) + 0.5), 0), n - 1)
     S = phase.S
     return (S[k, 0], S[k, 1], S[k, 2], S[k, 3], S[k, 4], S[k, 5])
+
+
+@jit
+def normals_at(phase, attribute):
+    """The distribution of flakes for an attribute in [0, 1]: the nearest one."""
+    rows = phase.table.kinds
+    row = min(max(int(attribute * (rows - 1) + 0.5), 0), rows - 1) if rows > 0 else -1
+    return flakes.Normals(flakes_at(phase, attribute), phase.table, row)
+
+
+@jit
+def projected_area(phase, attribute, w):
+    """sigma(w) of the flakes."""
+    if phase.kind == FLAKES:
+        return flakes.projected_area(normals_at(phase, attribute), w)
+    return sggx.projected_area(flakes_at(phase, attribute), w)
+
+
+@jit
+def has_density(phase):
+    """Whether ``evaluate`` is the density itself, not a random number with it as its mean."""
+    return phase.kind < SGGX_DIFFUSE or (phase.kind == FLAKES and phase.micro == flakes.SPECULAR)
 
 
 @jit
@@ -127,7 +190,13 @@ def of_cosine(phase, cosine):
 
 @jit
 def evaluate(phase, attribute, wo, wi, rng):
-    """f_p(wo, wi) in 1/sr. The diffuse flakes alone need random numbers; their value is right on average."""
+    """f_p(wo, wi) in 1/sr. Flakes that are not specular alone need random numbers; their value is right on average."""
+    if phase.kind == FLAKES:
+        n = normals_at(phase, attribute)
+        if phase.micro == flakes.SPECULAR:
+            return flakes.half_vector_density(n, wo, wi) / (4.0 * flakes.projected_area(n, wo))
+        m = flakes.sample_visible_normal(n, wo, rng)
+        return flakes.micro_density(phase.micro, phase.roughness, phase.ior, m, wo, wi)
     if phase.kind == SGGX_SPECULAR:
         return sggx.eval_specular(flakes_at(phase, attribute), wo, wi)
     if phase.kind == SGGX_DIFFUSE:
@@ -138,6 +207,12 @@ def evaluate(phase, attribute, wo, wi, rng):
 @jit
 def sample(phase, attribute, wo, rng):
     """wi with density f_p(wo, .): every phase function here is sampled exactly."""
+    if phase.kind == FLAKES:
+        n = normals_at(phase, attribute)
+        if phase.micro == flakes.SPECULAR:
+            return flakes.sample_specular(n, wo, rng)
+        m = flakes.sample_visible_normal(n, wo, rng)
+        return flakes.micro_sample(phase.micro, phase.roughness, phase.ior, m, wo, rng)
     if phase.kind == SGGX_SPECULAR:
         return sggx.sample_specular(flakes_at(phase, attribute), wo, rng)
     if phase.kind == SGGX_DIFFUSE:

@@ -7,16 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 
+from data_synth.detail import Detail
 from data_synth.fields import Columns
 from data_synth.jit import jit
 from data_synth.media import Medium
+from data_synth.microflakes import Table
 from data_synth.phase import NO_OWN, Phase
 
 ARRAYS = ("offsets", "samples", "attributes", "brick_max", "brick_min", "albedo", "Le", "fields", "faults")
 
 
 class Media(NamedTuple):
-    """numbers: (n, 40) the numbers of each medium; first: (n + 1, 10) where its arrays start in the arrays of all."""
+    """numbers: (n, 56) the numbers of each medium; first: (n + 1, 12) where its arrays start in the arrays of all."""
 
     numbers: np.ndarray
     first: np.ndarray
@@ -30,21 +32,29 @@ class Media(NamedTuple):
     fields: np.ndarray
     faults: np.ndarray
     S: np.ndarray
+    detail: np.ndarray
+    flakes: np.ndarray
 
 
 def pool(media: Sequence[Medium]) -> Media:
     """Put the arrays of several media one behind the other."""
-    numbers, first = np.zeros((len(media), 40)), np.zeros((len(media) + 1, 10), np.int64)
+    numbers, first = np.zeros((len(media), 56)), np.zeros((len(media) + 1, 12), np.int64)
     for k, m in enumerate(media):
         row = [m.kind, *m.lo, *m.hi, *m.cells, *m.bricks, *m.cell, m.max_density, *m.sigma_t, m.base, m.falloff, m.step]
         row += [m.flake_area, m.phase.kind, m.phase.g1, m.phase.g2, m.phase.mix, *m.columns, m.function]
+        row += [*m.detail.tiles, m.detail.erosion, m.detail.octaves, m.detail.n, m.detail.p]
+        row += [m.phase.micro, m.phase.roughness, m.phase.ior, *m.phase.table[1:]]
         numbers[k, : len(row)] = row
-        first[k + 1] = first[k] + [*(len(getattr(m, name)) for name in ARRAYS), len(m.phase.S)]
+        first[k + 1] = first[k] + [len(array) for array in _arrays(m)]
     empty = [np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0), np.zeros(0)]
     empty += [np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros(0), np.zeros((0, 6))]
-    own = [[*(getattr(m, name) for name in ARRAYS), m.phase.S] for m in media]
-    arrays = [np.concatenate(a) for a in zip(empty, *own, strict=True)]
-    return Media(numbers, first, *arrays)
+    empty += [np.zeros(0, np.float32), np.zeros(0)]
+    own = [_arrays(m) for m in media]
+    return Media(numbers, first, *(np.concatenate(a) for a in zip(empty, *own, strict=True)))
+
+
+def _arrays(m: Medium) -> list[np.ndarray]:
+    return [*(getattr(m, name) for name in ARRAYS), m.phase.S, m.detail.values, m.phase.table.values]
 
 
 @jit
@@ -71,9 +81,21 @@ def medium_at(media, k):
         n[21],
         n[22],
         n[23],
-        Phase(int(n[24]), n[25], n[26], n[27], media.S[a[9] : b[9]], NO_OWN),
+        Phase(
+            int(n[24]),
+            n[25],
+            n[26],
+            n[27],
+            media.S[a[9] : b[9]],
+            int(n[43]),
+            n[44],
+            n[45],
+            Table(media.flakes[a[11] : b[11]], int(n[46]), int(n[47]), int(n[48])),
+            NO_OWN,
+        ),
         media.fields[a[7] : b[7]],
         Columns(int(n[28]), int(n[29]), int(n[30]), int(n[31]), int(n[32]), int(n[33]), int(n[34])),
         int(n[35]),
         media.faults[a[8] : b[8]],
+        Detail(media.detail[a[10] : b[10]], int(n[41]), int(n[42]), (n[36], n[37], n[38]), n[39], int(n[40])),
     )

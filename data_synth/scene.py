@@ -14,13 +14,14 @@ from numpy.typing import ArrayLike
 
 from data_synth import lights as lamps
 from data_synth import materials as stuff
-from data_synth import media, surfaces, truth, volumes
+from data_synth import media, spongecake, surfaces, truth, volumes
 from data_synth.cameras import Camera, Viewpoints
 from data_synth.channels import Channels, split
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
 from data_synth.integrators import Integrator, Prepared, make
 from data_synth.pool import pool
+from data_synth.raycast import Classified
 from data_synth.world import COUNTERS, World
 
 NOTHING = media.homogeneous((0.0,) * 3, (1.0,) * 3, sigma_t=0.0)._replace(brick_max=np.zeros(1), max_density=0.0)
@@ -36,6 +37,7 @@ class Scene:
     else; if not it fills its whole box, except for what is inside glass. A boundary material that names a medium itself
     holds that one in both cases. opaque_sky: the picture shows the sky instead of being transparent there. integrators:
     by name, the first is the scene's own choice. exposure scales the colours of 8-bit pictures.
+    classified: the scan that the medium was made of, for ``raycast``.
 
     All of it may be changed between two renders; what integrators keep is made again then.
     """
@@ -55,6 +57,7 @@ class Scene:
     exposure: float = 1.0
     parameters: dict = field(default_factory=dict)
     media: list = field(default_factory=list)
+    classified: Classified | None = None
     prepared: dict[object, Prepared] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What integrators keep for the next view: arrays and shadow maps, which do not depend on the camera."""
     split: tuple[bytes, list[Scene] | None] | None = field(default=None, init=False, repr=False, compare=False)
@@ -81,7 +84,7 @@ class Scene:
             self.medium if self.medium is not None else NOTHING,
             pool(self.media),
             shapes,
-            stuff.Materials(self.boundaries(), _table(self.layers, 10)),
+            stuff.Materials(self.boundaries(), spongecake.stack(self.layers)),
             _table(rows, lamps.WIDTH),
             own[own[:, 0] == lamps.QUAD],
             own[own[:, 0] == lamps.SKY],

@@ -28,7 +28,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from data_synth import channels, clouds, lights, materials, media, phase, scenes, sggx, spongecake, surfaces, volumes
+from data_synth import (
+    channels,
+    clouds,
+    lights,
+    materials,
+    media,
+    microflakes,
+    phase,
+    scenes,
+    sggx,
+    spongecake,
+    surfaces,
+    volumes,
+)
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError
 from data_synth.integrators import INTEGRATORS
@@ -85,12 +98,21 @@ def volume(
 def cloud(
     kind: str = "cumulus", lo: media.Point = (-1.3, -1.3, -0.85), hi: media.Point = (1.3, 1.3, 0.85), resolution: int = 128,
     coverage: float = 0.95, scale: float = 1.0, erosion: float = 0.3, seed: int = 0, sigma_t: Any = 22.0, albedo: Any = 0.995,
-    phase: Any = None,
+    phase: Any = None, detail: int = 0,
 ) -> media.Medium:  # fmt: skip
-    """Clouds out of noise: stratus, cumulus or cumulonimbus."""
+    """Clouds out of noise: stratus, cumulus or cumulonimbus. detail: octaves of erosion below the voxel, 0 for none."""
     extent = surfaces.vector(hi, "hi") - surfaces.vector(lo, "lo")
     shape = tuple(max(int(n), 2) for n in resolution * extent / extent.max())
-    return media.grid(clouds.cloud(kind, shape, coverage, scale, erosion, seed), lo, hi, sigma_t, albedo, phase=phase)
+    rho = clouds.cloud(kind, shape, coverage, scale, 0.0 if detail else erosion, seed)
+    fine = clouds.detail_of(clouds.cloud_textures(seed), scale, erosion, detail) if detail else None
+    return media.grid(rho, lo, hi, sigma_t, albedo, phase=phase, detail=fine)
+
+
+def flakes_of(
+    S: Any, diffuse: bool = False, micro: str | None = None, roughness: float = 0.3, ior: float = 1.5
+) -> phase.Phase:
+    """Microflakes of one distribution: {fibre: ...} or another kind of flakes."""
+    return phase.microflakes(S, diffuse=diffuse, micro=micro, roughness=roughness, ior=ior)
 
 
 def layered(layers: Any) -> Any:
@@ -104,8 +126,10 @@ KINDS: dict[str, dict[str, Callable]] = {
     )},
     "phase": {f.__name__: f for f in (
         phase.isotropic, phase.rayleigh, phase.henyey_greenstein, phase.two_lobes,
-    )} | {"microflakes": lambda S, diffuse=False: phase.microflakes(S, diffuse=diffuse)},
-    "flakes": {"fibre": sggx.fibre, "surface": sggx.surface, "matrix": lambda S: sggx.check_sggx(S)},
+    )} | {"microflakes": flakes_of},
+    "flakes": {f.__name__: f for f in (
+        sggx.fibre, sggx.surface, microflakes.beckmann, microflakes.ggx, microflakes.trigonometric,
+    )} | {"matrix": lambda S: sggx.check_sggx(S)},
     "material": {f.__name__: f for f in (
         materials.lambert, materials.blinn_phong, materials.dielectric, materials.null, layered,
     )},
@@ -270,9 +294,9 @@ class _File:
             if not isinstance(value, str):
                 raise self.fail(where, f"expected a file name, got {value}")
             return str(self.path.parent / value)
-        if key in ("back", "kind"):
+        if key in ("back", "kind", "micro"):
             return value
-        if key == "diffuse":
+        if key in ("diffuse", "fibre", "schlick"):
             if not isinstance(value, bool):
                 raise self.fail(where, f"expected true or false, got {value}")
             return value

@@ -38,6 +38,11 @@ def _about(axis: ArrayLike, across: float, along: float, roughness: float) -> np
     return check_sggx(across * np.eye(3) + (along - across) * np.outer(a, a))
 
 
+def matrices(s: np.ndarray) -> np.ndarray:
+    """(..., 6) as (..., 3, 3)."""
+    return s[..., [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(*s.shape[:-1], 3, 3)
+
+
 def check_sggx(matrix: ArrayLike) -> np.ndarray:
     """The six numbers of a symmetric positive definite 3x3 matrix; anything else is an error."""
     s = np.asarray(matrix, dtype=np.float64)

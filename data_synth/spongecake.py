@@ -1,47 +1,125 @@
-"""SpongeCake: flat layers of SGGX microflakes as one position-free surface reflectance [Wang et al. 2022], PHYSICS 12.
+"""SpongeCake: flat layers of microflakes as one position-free surface reflectance [Wang et al. 2022], PHYSICS 12.
 
-Directions are local: z is the surface normal, wo and wi point outward. A layer has thickness times density tau, a
-6-number S and an RGB albedo F. With Lambda(w) = sigma(w) / |cos w| and h the unit half vector, single scattering in a
-layer gives
-    reflection     f = F D(h) / (4 |cos wi cos wo|) (1 - e^(-tau (Li + Lo))) / (Li + Lo)
-    transmission   f = F D(h) / (4 |cos wi cos wo|) (e^(-tau Lo) - e^(-tau Li)) / (Li - Lo)
+Directions are local: z is the surface normal, wo and wi point outward. A layer has thickness times density tau, flakes of
+any distribution (``microflakes.py``) that are mirrors, and what they mirror, F. With Lambda(w) = sigma(w) / |cos w| and h
+the unit half vector, single scattering in a layer gives
+    reflection     f = F(wo.h) D(h) / (4 |cos wi cos wo|) (1 - e^(-tau (Li + Lo))) / (Li + Lo)
+    transmission   f = F(wo.h) D(h) / (4 |cos wi cos wo|) (e^(-tau Lo) - e^(-tau Li)) / (Li - Lo)
 times the attenuation e^(-tau Lambda) of the layers that either leg crosses besides; light that meets no flake goes
-straight on with weight e^(-sum tau Lambda(wo)).
+straight on with weight e^(-sum tau Lambda(wo)). What a flake does not mirror it absorbs.
 
-A layer table is (n, 10) float: tau, S (6), F (3); rows from the top (+z) down.
+F is the RGB albedo; or that times Fresnel's reflectance of an index eta + i k; or Schlick's, albedo at normal incidence.
+
+A row of the layer table is tau, S (6), albedo (3), kind of F, eta (3), k (3), 1 + row of the table of D or 0; rows from the
+top (+z) down.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from data_synth import sggx
+from data_synth import fresnel, microflakes
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.media import rgb
 from data_synth.rng import uniform
+from data_synth.vec import add, dot
+
+WIDTH = 18
+CONSTANT, SCHLICK, EXACT = range(3)
+FLAKES = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
-def layer(tau: float, S: Sequence[float] | np.ndarray, albedo: ArrayLike) -> np.ndarray:
-    """One layer: tau >= 0, S from ``sggx.fibre`` or ``sggx.surface``, albedo grey or RGB in [0, 1]."""
+class Layers(NamedTuple):
+    """All layers of a scene: their rows, and the tables of those whose flakes are no SGGX."""
+
+    rows: np.ndarray
+    table: microflakes.Table
+
+
+class Tabulated(NamedTuple):
+    """A layer whose flakes are one table."""
+
+    row: np.ndarray
+    table: microflakes.Table
+
+
+def layer(
+    tau: float, S: Sequence[float] | np.ndarray | microflakes.Table, albedo: ArrayLike, schlick: bool = False,
+    eta: ArrayLike | None = None, k: ArrayLike = 0.0,
+) -> np.ndarray | Tabulated:  # fmt: skip
+    """One layer: tau >= 0, S from ``sggx.fibre``, ``sggx.surface`` or a table of ``microflakes``, albedo grey or RGB in [0, 1].
+
+    schlick: albedo is what flakes mirror at normal incidence. eta, k: they mirror albedo times the reflectance of that
+    index of refraction, grey or RGB; k = 0 is a dielectric (1.5: wax), more a metal (eta 0.2, k 3.4: gold's red).
+    """
     if not (math.isfinite(tau) and tau >= 0):
         raise InputError(f"SpongeCake layer: tau must be finite and not negative, got {tau}")
-    return np.array([float(tau), *S, *rgb(albedo, "albedo", 1.0)])
+    if schlick and eta is not None:
+        raise InputError("SpongeCake layer: expected either schlick or eta, got both")
+    of = (CONSTANT, (1.0,) * 3, (0.0,) * 3) if eta is None else (EXACT, rgb(eta, "eta"), rgb(k, "k"))
+    if min(of[1]) <= 0:
+        raise InputError(f"SpongeCake layer: eta must be positive, got {eta}")
+    kind = SCHLICK if schlick else of[0]
+    own = FLAKES if isinstance(S, microflakes.Table) else S
+    row = np.array([float(tau), *own, *rgb(albedo, "albedo", 1.0), kind, *of[1], *of[2], 0.0])
+    if not isinstance(S, microflakes.Table):
+        return row
+    if S.kinds != 1:
+        raise InputError(f"SpongeCake layer: expected one distribution of flakes, got {S.kinds}")
+    return Tabulated(row, S)
+
+
+def stack(layers: Sequence[np.ndarray | Tabulated]) -> Layers:
+    """The layers as kernels take them."""
+    rows, tables = np.zeros((len(layers), WIDTH)), []
+    for k, given in enumerate(layers):
+        row = given.row if isinstance(given, Tabulated) else np.asarray(given, float)
+        rows[k, : len(row)] = row
+        if isinstance(given, Tabulated):
+            tables.append(given.table)
+            rows[k, 17] = len(tables)
+    return Layers(rows, microflakes.together(tables))
 
 
 @jit
 def flakes(layers, k):
-    return (layers[k, 1], layers[k, 2], layers[k, 3], layers[k, 4], layers[k, 5], layers[k, 6])
+    r = layers.rows
+    S = (r[k, 1], r[k, 2], r[k, 3], r[k, 4], r[k, 5], r[k, 6])
+    return microflakes.Normals(S, layers.table, int(r[k, 17]) - 1)
+
+
+@jit
+def mirrored(layers, k, wo, wi):
+    """RGB F of a flake of layer k that mirrors wo to wi."""
+    r = layers.rows
+    albedo = (r[k, 7], r[k, 8], r[k, 9])
+    if r[k, 10] == CONSTANT:
+        return albedo
+    h = add(wo, wi)
+    cosine = min(math.sqrt(dot(h, h)) * 0.5, 1.0)  # wo.h, |h| = 2 cos
+    if r[k, 10] == SCHLICK:
+        return (
+            fresnel.schlick(cosine, albedo[0]),
+            fresnel.schlick(cosine, albedo[1]),
+            fresnel.schlick(cosine, albedo[2]),
+        )
+    return (
+        albedo[0] * fresnel.reflectance(cosine, r[k, 11], r[k, 14]),
+        albedo[1] * fresnel.reflectance(cosine, r[k, 12], r[k, 15]),
+        albedo[2] * fresnel.reflectance(cosine, r[k, 13], r[k, 16]),
+    )
 
 
 @jit
 def slant(s, w):
     """Lambda(w), bounded where the ray grazes the layer."""
-    return sggx.projected_area(s, w) / max(abs(w[2]), 1e-9)
+    return microflakes.projected_area(s, w) / max(abs(w[2]), 1e-9)
 
 
 @jit
@@ -49,7 +127,7 @@ def attenuation(layers, first, last, w):
     """Transmittance of layers first..last - 1 along w."""
     total = 0.0
     for k in range(first, last):
-        total += layers[k, 0] * slant(flakes(layers, k), w)
+        total += layers.rows[k, 0] * slant(flakes(layers, k), w)
     return math.exp(-total)
 
 
@@ -81,9 +159,15 @@ def evaluate(layers, first, last, wo, wi):
         return (0.0, 0.0, 0.0)
     for k in range(first, last):
         s = flakes(layers, k)
-        depth = depth_integral(layers[k, 0], slant(s, wo), slant(s, wi), wo[2] * wi[2] > 0.0)
-        f = sggx.half_vector_density(s, wo, wi) / (4.0 * cosines) * depth * other_legs(layers, first, last, k, wo, wi)
-        r, g, b = r + f * layers[k, 7], g + f * layers[k, 8], b + f * layers[k, 9]
+        depth = depth_integral(layers.rows[k, 0], slant(s, wo), slant(s, wi), wo[2] * wi[2] > 0.0)
+        f = (
+            microflakes.half_vector_density(s, wo, wi)
+            / (4.0 * cosines)
+            * depth
+            * other_legs(layers, first, last, k, wo, wi)
+        )
+        F = mirrored(layers, k, wo, wi)
+        r, g, b = r + f * F[0], g + f * F[1], b + f * F[2]
     return (r, g, b)
 
 
@@ -94,8 +178,8 @@ def pdf(layers, first, last, wo, wi):
     for n in range(last - first):
         k = first + n if wo[2] > 0.0 else last - 1 - n
         s = flakes(layers, k)
-        through = math.exp(-layers[k, 0] * slant(s, wo))
-        f = sggx.half_vector_density(s, wo, wi) / (4.0 * sggx.projected_area(s, wo))
+        through = math.exp(-layers.rows[k, 0] * slant(s, wo))
+        f = microflakes.half_vector_density(s, wo, wi) / (4.0 * microflakes.projected_area(s, wo))
         total += reach * (1.0 - through) * f
         reach *= through
     return total
@@ -108,7 +192,7 @@ def sample(layers, first, last, wo, rng):
     for n in range(last - first):
         k = first + n if wo[2] > 0.0 else last - 1 - n
         s = flakes(layers, k)
-        reach *= math.exp(-layers[k, 0] * slant(s, wo))
+        reach *= math.exp(-layers.rows[k, 0] * slant(s, wo))
         if u >= reach:
-            return sggx.sample_specular(s, wo, rng), False
+            return microflakes.sample_specular(s, wo, rng), False
     return (-wo[0], -wo[1], -wo[2]), True

@@ -17,7 +17,8 @@ from __future__ import annotations
 import math
 
 from data_synth.jit import jit
-from data_synth.media import EXPONENTIAL, HOMOGENEOUS, box_interval, extinction
+from data_synth.lookups import box_interval, extinction
+from data_synth.media import EXPONENTIAL, HOMOGENEOUS
 from data_synth.phase import SGGX_SPECULAR
 from data_synth.rng import uniform
 from data_synth.traverse import cells, chord_thickness, collisions, steps, traversal

@@ -83,8 +83,9 @@ def _method(m: Medium, name: str, methods: dict) -> int:
         raise InputError(f"method: expected one of {', '.join(methods)}, got '{name}'")
     if name == "closed" and (m.kind not in (HOMOGENEOUS, EXPONENTIAL) or methods is DISTANCE_METHODS and m.kind):
         raise InputError("method: this medium has no closed form, expected another method than 'closed'")
-    if name == "regular" and m.kind == FUNCTION:
+    if name == "regular" and (m.kind == FUNCTION or m.detail.octaves):
+        kind = "density function" if m.kind == FUNCTION else "density with detail"
         raise InputError(
-            "method: regular tracking is exact cell by cell and a density function has none, expected another"
+            f"method: regular tracking is exact cell by cell and a {kind} is no polynomial there, expected another"
         )
     return methods[name]

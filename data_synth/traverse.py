@@ -16,7 +16,8 @@ import math
 from collections.abc import Callable
 
 from data_synth.jit import jit
-from data_synth.media import EXPONENTIAL, GRID, extinction
+from data_synth.lookups import extinction
+from data_synth.media import EXPONENTIAL, GRID
 from data_synth.rng import uniform
 from data_synth.vec import along, largest
 

@@ -7,6 +7,10 @@
 | ``mediumK_lo``, ``_hi``                 | its box                                                                     |
 | ``mediumK_sigma_t``                     | (3,) extinction per density in 1/u                                          |
 | ``mediumK_density``, ``_attribute``     | samples at the vertices of a grid from lo to hi; the attribute only if any  |
+| ``mediumK_micro``, ``_roughness``,     | of other microflakes: ``microflakes.py``; D: (n, rows + 1, columns) normals  |
+| ``_ior``, ``_D``                        | at polar angles 0 ... pi/2 and azimuths 0 ... 2 pi; none: S                  |
+| ``mediumK_noise``, ``_curl``, ``_tiles``| of a cloud with detail below its grid, as ``detail.py`` erodes the density;  |
+| ``mediumK_erosion``, ``_octaves``       | z from lo to hi is its height in [0, 1]                                      |
 | ... of kind rgb_grid                    | density and albedo are (nx, ny, nz, 3): extinction in 1/u, and albedo       |
 | ... above 2^28 samples                  | no dense arrays: ``_cells``, ``_offsets`` (first sample of each brick of 8^3 |
 |                                         | cells, -1: empty), ``_samples``, ``_attributes``, ``_fields``, ``_columns`` |
@@ -19,7 +23,7 @@
 | ``mediumK_g_grid``, ``_S_grid``         | (nx, ny, nz) in place of g1, (nx, ny, nz, 6) in place of S, where they vary |
 | ``number``, ``number_lo``, ``number_hi``| medium at each vertex of a grid, -1 for none; media are cut by boundaries   |
 | ``shapes``, ``triangles``, ``materials``| tables as ``surfaces`` and ``materials`` describe them                      |
-| ``layers``, ``lights``                  | tables as ``spongecake`` and ``lights`` describe them                       |
+| ``layers``, ``layers_D``, ``lights``    | tables as ``spongecake``, ``microflakes`` and ``lights`` describe them       |
 """
 
 from __future__ import annotations
@@ -30,8 +34,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_synth import materials as stuff
-from data_synth import media, surfaces
+from data_synth import media, microflakes, spongecake, surfaces
+from data_synth import phase as phases
 from data_synth.channels import Channels
+from data_synth.detail import Detail
 from data_synth.files import replacing
 from data_synth.functions import COMPILED
 from data_synth.volumes import is_large
@@ -43,7 +49,7 @@ RESOLUTION = 64  # cells along the longest side of ``number``
 KINDS = {
     media.HOMOGENEOUS: "homogeneous", media.GRID: "grid", media.EXPONENTIAL: "exponential", media.FUNCTION: "function",
 }  # fmt: skip
-PHASES = ("isotropic", "rayleigh", "henyey_greenstein", "sggx_specular", "sggx_diffuse")
+PHASES = ("isotropic", "rayleigh", "henyey_greenstein", "sggx_specular", "sggx_diffuse", "microflakes")
 
 
 def write(scene: Scene, path: Path) -> None:
@@ -54,10 +60,10 @@ def write(scene: Scene, path: Path) -> None:
             described = _channels(m) if isinstance(m, Channels) else _medium(m)
             arrays |= {f"medium{k}_{name}": np.asarray(value) for name, value in described.items()}
     lo, hi, number = numbers(scene)
-    geometry = surfaces.geometry(scene.shapes, scene.triangles)
+    geometry, layers = surfaces.geometry(scene.shapes, scene.triangles), spongecake.stack(scene.layers)
     arrays |= {
         "number": number, "number_lo": lo, "number_hi": hi, "shapes": geometry.shapes, "triangles": geometry.triangles,
-        "materials": scene.boundaries(), "layers": np.array(scene.layers, float).reshape(-1, 10),
+        "materials": scene.boundaries(), "layers": layers.rows, "layers_D": layers.table.D,
         "lights": np.array(scene.lights, float).reshape(-1, 16),
     }  # fmt: skip
     with replacing(path) as temporary:
@@ -78,7 +84,12 @@ def _medium(m: media.Medium) -> dict[str, object]:
         "kind": KINDS[m.kind], "lo": m.lo, "hi": m.hi, "sigma_t": m.sigma_t, "albedo": m.albedo, "Le": m.Le,
         "phase": PHASES[m.phase.kind], "g": (m.phase.g1, m.phase.g2, m.phase.mix), "S": m.phase.S,
     }  # fmt: skip
+    if m.phase.kind == phases.FLAKES:
+        micro = list(microflakes.MICRO)[m.phase.micro]
+        out |= {"micro": micro, "roughness": m.phase.roughness, "ior": m.phase.ior, "D": m.phase.table.D}
     if m.kind == media.GRID:
+        if m.detail.octaves:
+            out |= _detail(m.detail)
         if is_large(m):
             return out | _in_bricks(m)
         out["density"] = media.dense(m)
@@ -90,6 +101,14 @@ def _medium(m: media.Medium) -> dict[str, object]:
     if m.kind == media.EXPONENTIAL:
         out["height"] = 1.0 / m.falloff
     return out
+
+
+def _detail(d: Detail) -> dict[str, object]:
+    size = d.n**3
+    return {
+        "noise": d.values[:size].reshape((d.n,) * 3), "curl": d.values[size:].reshape(d.p, d.p, 2), "tiles": d.tiles,
+        "erosion": d.erosion, "octaves": d.octaves,
+    }  # fmt: skip
 
 
 def _in_bricks(m: media.Medium) -> dict[str, object]:
@@ -133,6 +152,8 @@ def described(scene: Scene) -> dict[str, dict[str, object]]:
             told["density"] = [*grid, 3] if isinstance(m, Channels) else grid
         varied = {"albedo": c.albedo >= 0 or isinstance(m, Channels), "Le": c.Le >= 0, "g": c.g >= 0, "S": c.S >= 0}
         told |= {name: "grid" for name, is_grid in varied.items() if is_grid}
+        if one.detail.octaves:
+            told["detail"] = f"{one.detail.octaves} octaves"
         if one.kind == media.FUNCTION:
             told["density"] = f"the function {COMPILED[one.function].name}"
         out[f"medium{k}"] = told

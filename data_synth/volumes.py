@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from data_synth import blackbody, media, medical
+from data_synth import blackbody, lookups, media, medical
 from data_synth.bricks import BRICK, SIDE, Sparse
 from data_synth.errors import InputError, RenderWarning
 from data_synth.files import replacing
+from data_synth.jit import in_bands, kernel
 from data_synth.vdb import grid_names, read_blocks, read_vdb
 from data_synth.vdb_write import SparseGrid, write_grids, write_vdb
 
@@ -190,19 +191,23 @@ def _read_raw(path: Path) -> np.ndarray:
 
 
 def write_density(m: media.Medium, out_dir: Path) -> None:
-    """density.npz and density.vdb: green extinction in 1/u at the samples of a grid medium, and where they are."""
+    """density.npz and density.vdb: green extinction in 1/u at the samples of a grid medium, and where they are.
+
+    Of a medium with detail below its grid at twice as many along each side, unless that is too many.
+    """
     if is_large(m):
         _write_bricks(m, out_dir)
         return
-    sigma = media.dense(m) * np.float32(m.sigma_t[1])
+    finer = 2 if m.detail.octaves and not is_large(m, 2) else 1
+    sigma, cell = sampled(m, finer) * np.float32(m.sigma_t[1]), media.triple(c / finer for c in m.cell)
     with replacing(out_dir / "density.npz") as temporary:
-        np.savez_compressed(temporary, density=sigma, lo=m.lo, hi=m.hi, voxel_size=m.cell)
-    write_vdb(out_dir / "density.vdb", sigma, m.cell, m.lo)
+        np.savez_compressed(temporary, density=sigma, lo=m.lo, hi=m.hi, voxel_size=cell)
+    write_vdb(out_dir / "density.vdb", sigma, cell, m.lo)
 
 
-def is_large(m: media.Medium) -> bool:
-    """Whether a dense array of its samples is not made."""
-    return float(np.prod(np.array(m.cells, float) + 1)) > LARGE
+def is_large(m: media.Medium, finer: int = 1) -> bool:
+    """Whether a dense array of its samples, ``finer`` to a cell, is not made."""
+    return float(np.prod(finer * np.array(m.cells, float) + 1)) > LARGE
 
 
 def _write_bricks(m: media.Medium, out_dir: Path) -> None:
@@ -220,5 +225,31 @@ def _write_bricks(m: media.Medium, out_dir: Path) -> None:
         own[tuple(upper)] &= (brick[:, axis] == m.bricks[axis] - 1).reshape(-1, 1, 1, 1)
     k, *inside = np.nonzero(own)
     coords = (brick[k] * BRICK + np.stack(inside, axis=1)).astype(np.int32)
-    values = samples[own] * np.float32(m.sigma_t[1])
+    values = samples[own]
+    if m.detail.octaves:
+        in_bands(lambda a, b: _erode(m, coords, values, a, b), len(values), 1 << 16)
+    values = values * np.float32(m.sigma_t[1])
     write_grids(out_dir / "density.vdb", [SparseGrid("density", coords, values, m.cell, m.lo)], half=False)
+
+
+@kernel
+def _erode(m, coords, values, first, last):
+    for s in range(first, last):
+        values[s] = lookups.density(m, lookups.vertex(m, coords[s, 0], coords[s, 1], coords[s, 2], 1))
+
+
+def sampled(m: media.Medium, finer: int = 1) -> np.ndarray:
+    """The (finer (nx - 1) + 1, ...) float32 density, detail and all, at the vertices of a grid medium's cells, cut."""
+    if finer == 1 and m.detail.octaves == 0:
+        return media.dense(m)
+    out = np.empty([finer * n + 1 for n in m.cells], np.float32)
+    in_bands(lambda a, b: _sample(m, finer, out, a, b), len(out), 4)
+    return out
+
+
+@kernel
+def _sample(m, finer, out, first, last):
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            for k in range(out.shape[2]):
+                out[i, j, k] = lookups.density(m, lookups.vertex(m, i, j, k, finer))

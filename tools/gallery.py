@@ -18,6 +18,7 @@ PICTURES = {
     "cloud": f"cloud {TRACED} 480x360",
     "cumulonimbus": f"cumulonimbus {TRACED} 360x360",
     "stratus": f"stratus {TRACED} 640x400",
+    "cloudscape": f"cloudscape {TRACED} 640x400",
     "explosion": f"explosion {TRACED} 360x360",
     "phantom": f"phantom {TRACED} 480x480",
     "smoke": f"smoke {TRACED} 480x480",

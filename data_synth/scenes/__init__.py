@@ -12,6 +12,7 @@ import numpy as np
 from data_synth import checks, lights
 from data_synth.errors import InputError
 from data_synth.scene import Scene
+from data_synth.scenes.landscape import cloudscape
 from data_synth.scenes.showcase import Showcase
 from data_synth.scenes.simple import cloth, fog, leaf, mist, slab, solids, sphere
 from data_synth.scenes.volumes import cloud, cumulonimbus, explosion, phantom, smoke, stratus
@@ -19,7 +20,7 @@ from data_synth.scenes.volumes import cloud, cumulonimbus, explosion, phantom, s
 SCENES: Mapping[str, Callable[..., Showcase | Scene]] = {"showcase": Showcase} | {
     scene.__name__: scene
     for scene in (
-        cloud, cumulonimbus, stratus, smoke, explosion, fog, mist, solids, phantom, cloth, leaf, slab, sphere,
+        cloud, cumulonimbus, stratus, cloudscape, smoke, explosion, fog, mist, solids, phantom, cloth, leaf, slab, sphere,
     )
 }  # fmt: skip
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
 
-from data_synth import blackbody, clouds, lights, materials, media, phase, surfaces
+from data_synth import blackbody, clouds, lights, materials, media, phase, raycast, surfaces
+from data_synth import transfer as transfers
 from data_synth.bricks import Sparse
 from data_synth.cameras import Viewpoints
 from data_synth.errors import InputError, RenderWarning
@@ -25,16 +26,20 @@ EVENING_SKY = lights.sky((0.75, 1.1, 1.9), (1.3, 1.2, 1.2), (0.5, 0.45, 0.5))
 
 def cloud(
     coverage: float = 0.95, density: float = 22.0, resolution: int = 128, erosion: float = 0.3, seed: int = 0,
-    volume: str | None = None,
+    volume: str | None = None, detail: int = 0,
 ) -> Scene:  # fmt: skip
-    """a cumulus at sunset: warm sun from the side, blue sky above"""
+    """a cumulus at sunset: warm sun from the side, blue sky above
+
+    detail: octaves of noise that erode the cloud (or volume) where a ray asks for it, finer than any voxel; 0: at the voxels.
+    """
     lo, hi = (-1.3, -1.3, -0.85), (1.3, 1.3, 0.85)
     shape = (resolution, resolution, int(resolution * 1.7 / 2.6))
     if volume is None:
-        rho = clouds.cloud("cumulus", shape, coverage, 1.0, erosion, seed)
+        rho = clouds.cloud("cumulus", shape, coverage, 1.0, 0.0 if detail else erosion, seed)
     else:
         rho, lo, hi = _scaled(volume, open_volume(volume, uses=()), lo, hi)
-    medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE)
+    fine = clouds.detail_of(cloud_textures(seed), 1.0, erosion, detail) if detail else None
+    medium = media.grid(rho, lo, hi, density, 0.995, phase=CLOUD_PHASE, detail=fine)
     return Scene(
         medium=medium,
         lights=[EVENING_SUN, EVENING_SKY],
@@ -166,21 +171,21 @@ def phantom(
 ) -> Scene:
     """a CT-like head phantom through a transfer function: skin, bone and inner organs; takes --volume stent.npz
 
-    transfer: a text file of lines ``value opacity red green blue`` in the volume's own values, instead of TISSUE over
-    its positive range. mode: lit, or emission, which shows the colours themselves as a CT viewer does.
+    transfer: a file of control points in the volume's own values (``transfer.py``), instead of TISSUE over the window that the
+    volume's histogram suggests. mode: lit, or emission, which shows the colours themselves as a CT viewer does.
     """
     if mode not in ("lit", "emission"):
         raise InputError(f"scene phantom: mode expects lit or emission, got {mode}")
     points, lo, hi = TISSUE, (-0.8, -1.0, -0.8), (0.8, 1.0, 0.8)
-    if transfer is not None:
-        points, value_range = _transfer(transfer)
-        if volume is None:
+    if volume is None:
+        if transfer is not None:
             raise InputError("scene phantom: transfer belongs to a --volume, expected one")
-        value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3, values=value_range)
-    elif volume is not None:
-        value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3)
-    else:
         value = _head(resolution)
+    else:
+        window = None
+        if transfer is not None:
+            points, window = _over(transfers.read(transfer))
+        value, lo, hi = _imported(volume, (-1.1,) * 3, (1.1,) * 3, values=window or transfers.window)
     opacity = np.interp(value, points[:, 0], points[:, 1]).astype(np.float32)
     colours = np.stack([np.interp(np.linspace(0, 1, 256), points[:, 0], points[:, c]) for c in (2, 3, 4)], axis=1)
     albedo, glow = (colours, 0.0) if mode == "lit" else (0.0, colours)
@@ -189,27 +194,18 @@ def phantom(
         medium=medium,
         lights=[lights.directional((0.6, -0.8, 0.9), 7.0), lights.environment(0.55)] if mode == "lit" else [],
         viewpoints=Viewpoints(radius=4.0, elevation=(-20, 60), fov=38),
-        integrators=("deep", "march", "path", "emission") if mode == "lit" else ("emission", "path"),
+        integrators=("deep", "march", "path", "emission", "raycast")
+        if mode == "lit"
+        else ("emission", "path", "raycast"),
         aabb=np.array([lo, hi]),
+        classified=raycast.classified(value, lo, hi, points, density),
     )
 
 
-def _transfer(path: str) -> tuple[np.ndarray, tuple[float, float]]:
-    """(points as TISSUE with values scaled to [0, 1], the smallest and largest value) of a file."""
-    try:
-        with open(path, encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an empty file is said to be wrong below
-            points = np.loadtxt(file, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected lines of value, opacity, red, green, blue: {error}") from error
-    shape = points.shape[1:] == (5,) and len(points) > 1
-    if not shape or not np.isfinite(points).all() or (np.diff(points[:, 0]) <= 0).any():
-        raise InputError(f"{path}: expected two or more lines of value, opacity, red, green, blue, values ascending")
-    if points[:, 1:].min() < 0 or points[:, 1:].max() > 1:
-        raise InputError(f"{path}: expected opacities and colours in [0, 1]")
-    low, high = points[0, 0], points[-1, 0]
-    points[:, 0] = (points[:, 0] - low) / (high - low)
-    return points, (float(low), float(high))
+def _over(points: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
+    """(points with values scaled to [0, 1], the smallest and largest value)."""
+    low, high = float(points[0, 0]), float(points[-1, 0])
+    return np.concatenate([(points[:, :1] - low) / (high - low), points[:, 1:]], axis=1), (low, high)
 
 
 def _head(n: int) -> np.ndarray:
@@ -265,11 +261,13 @@ def _placed(
 
 
 def _imported(
-    volume: str, lo: media.Point, hi: media.Point, values: tuple[float, float] | None = None
-) -> tuple[np.ndarray, media.Point, media.Point]:
-    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows. values: what becomes 0 and 1."""
+    volume: str, lo: media.Point, hi: media.Point,
+    values: tuple[float, float] | Callable[[np.ndarray], tuple[float, float]] | None = None,
+) -> tuple[np.ndarray, media.Point, media.Point]:  # fmt: skip
+    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows. values: what becomes 0 and 1, or how to
+    tell from the samples."""
     samples, spacing = read_volume(volume)
-    low, high = values or (0.0, float(samples.max()))
+    low, high = (values(samples) if callable(values) else values) or (0.0, float(samples.max()))
     if high <= low:
         raise InputError(f"{volume}: expected a density that is somewhere positive, got at most {high:g}")
     if values is None and samples.min() < 0:

@@ -40,7 +40,7 @@ def _normals(ph, wo, directions, out):
 
 @kernel
 def _cake(layers, wo, directions, out):
-    n = layers.shape[0]
+    n = layers.rows.shape[0]
     for k in range(len(directions)):
         wi = (directions[k, 0], directions[k, 1], directions[k, 2])
         out[k, 0], out[k, 1], out[k, 2] = spongecake.evaluate(layers, 0, n, wo, wi)
@@ -50,7 +50,7 @@ def _cake(layers, wo, directions, out):
 @kernel
 def _cake_sample(layers, wo, rng, out):
     for k in range(len(out)):
-        w, straight = spongecake.sample(layers, 0, layers.shape[0], wo, rng)
+        w, straight = spongecake.sample(layers, 0, layers.rows.shape[0], wo, rng)
         out[k, 0], out[k, 1], out[k, 2] = w
         out[k, 3] = 1.0 if straight else 0.0
 
@@ -80,13 +80,13 @@ def flake_values(ph, directions):
 
 def cake_values(layers, wo, directions):
     out = np.empty((len(directions), 4))
-    _cake(layers, wo, directions, out)
+    _cake(spongecake.stack(list(layers)), wo, directions, out)
     return out[:, :3], out[:, 3]
 
 
 def cake_samples(layers, wo, n, seed=0):
     out = np.empty((n, 4))
-    _cake_sample(layers, wo, new_rng(seed, 0), out)
+    _cake_sample(spongecake.stack(list(layers)), wo, new_rng(seed, 0), out)
     return out[:, :3], out[:, 3] > 0
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_synth import clouds, noise
+from data_synth import clouds, noise, scenes
 from data_synth.errors import InputError
 from data_synth.jit import kernel
 
@@ -90,3 +90,9 @@ def test_bad_requests_are_refused():
         clouds.cloud("cumulus", (4, 4, 4), 1.5)
     with pytest.raises(InputError, match="type"):
         clouds.cloud("cirrus", (4, 4, 4))
+
+
+def test_other_lights_leave_a_scene_its_exposure():
+    """Pictures of one scene under several lights can be compared, however dark they are; --exposure is there to change it."""
+    own, other = scenes.make("stratus", resolution=8), scenes.make("stratus", "panel", resolution=8)
+    assert own.exposure == other.exposure != 1.0 and len(other.lights) == 1
