@@ -40,7 +40,11 @@ from nerfvol.views import OctreeModel, SplatModel
 RESERVE_SHARE = 0.2
 """Of a time budget, the most that is kept for writing and scoring."""
 EXPECTED_SECONDS_TO_WRITE = 2.0
-"""Before there is a representation that tells."""
+"""Of an octree, before there is one that tells ..."""
+SECONDS_TO_WRITE = 0.5
+"""... and of all else."""
+PREVIEW_SHARE, PREVIEW_SECONDS = 0.01, 0.08
+"""Of a time budget, what previews may take together; and for the first one, before it was measured."""
 TABLE_SECONDS = 0.008
 """For a training photograph's row in the table of photographs."""
 FIT_SECONDS = 0.5
@@ -139,6 +143,7 @@ class Run:
         self._reserve = self._time_to_finish()
         self._last_save = time.perf_counter()
         self._warned: set[str] = set()
+        self._previewed, self._preview_cost = 0.0, PREVIEW_SECONDS  # seconds, of all and of the last
 
     def enter(self, phase: Phase) -> None:
         """Begin the phase, or go on inside it where the checkpoint was written in it.
@@ -274,7 +279,11 @@ class Run:
             self.data.training.release()
 
     def preview(self, phase: Phase, moment: float) -> None:
-        """The first held-out view, small: truth next to what the phase has."""
+        """The first held-out view, small: truth next to what the phase has. A time budget is for training: what previews may
+        take of it is bounded."""
+        budget, started = self.config.time_budget, time.perf_counter()
+        if budget is not None and self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
+            return
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
         truth = np.divide(composite_average(image, self.background, k), 255, dtype=np.float32)
@@ -284,6 +293,8 @@ class Run:
             pictures.write_png(path, picture)
         except InputError as error:
             self.warn(f"{error}; the run goes on without this preview")
+        self._preview_cost = time.perf_counter() - started
+        self._previewed += self._preview_cost
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
@@ -351,11 +362,12 @@ class Run:
         if phase is not None:
             phase.picture(self.data.held_out.cameras[0])
         rendering = 0.1e-6 * image.size / 3 if phase is None else time.perf_counter() - started
-        writing = EXPECTED_SECONDS_TO_WRITE if phase is None else phase.seconds_to_write()
+        expected = EXPECTED_SECONDS_TO_WRITE if self.config.representation == "octree" else SECONDS_TO_WRITE
+        rows = len(self.data.training) if self.data.training.scene.is_unbounded else 0
         return min(
-            writing
+            (expected if phase is None else phase.seconds_to_write())
             + self.data.reading
-            + TABLE_SECONDS * len(self.data.training)
+            + TABLE_SECONDS * rows
             + 1.1 * len(self.data.held_out) * (scoring + rendering + FIT_SECONDS * self.config.refine_poses),
             RESERVE_SHARE * self.config.time_budget,
         )
