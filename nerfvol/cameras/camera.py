@@ -254,11 +254,18 @@ class Camera:
 
     def scaled(self, k: int) -> Camera:
         """The camera of the image area-averaged over k x k blocks."""
-        return replace(self, intrinsics=self.intrinsics.scaled(k))
+        return self.through(self.intrinsics.scaled(k))
 
     def resized(self, width: int, height: int) -> Camera:
         """The camera of the image at another size (see Intrinsics.resized)."""
-        return replace(self, intrinsics=self.intrinsics.resized(width, height))
+        return self.through(self.intrinsics.resized(width, height))
+
+    def through(self, intrinsics: Intrinsics) -> Camera:
+        """The camera at its place with other intrinsics: the pose, which was found rigid, is not looked at again."""
+        camera = object.__new__(Camera)
+        for name, value in (("intrinsics", intrinsics), ("c2w", self.c2w), ("light", self.light)):
+            object.__setattr__(camera, name, value)
+        return camera
 
 
 def rigid_pose(c2w: ArrayLike) -> Float:

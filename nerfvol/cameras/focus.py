@@ -44,8 +44,12 @@ def focus_point(cameras: Sequence[Camera]) -> Focus:
     Axes that miss the point of least mean distance (by weights 1 / distance, Weiszfeld 1937) six times as far as the median
     axis are left out: one camera astray would move a least-squares point at will.
     """
-    origins = np.stack([camera.position for camera in cameras])
-    axes = np.stack([camera.forward for camera in cameras])
+    return focus_of(np.stack([camera.c2w for camera in cameras]))
+
+
+def focus_of(poses: NDArray[np.float64]) -> Focus:
+    """As :func:`focus_point`, of camera-to-world matrices (n, 4, 4)."""
+    origins, axes = poses[:, :3, 3], -poses[:, :3, 2]
     middle = np.median(origins, axis=0)
     origins = origins - middle  # map coordinates would cost the squares their digits
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]

@@ -15,12 +15,12 @@ SCENE = "scene"
 
 def without_poses(path: Path) -> bool:
     """Whether ``path`` is a video, or a folder of pictures that no format of posed images recognises."""
+    if not path.is_file() and (not path.is_dir() or any(row.reader.recognises(path) for row in FORMATS)):
+        return False
     from nerfvol.poses.sources import HEIF_SUFFIXES, SUFFIXES, is_video
 
     if path.is_file():
         return is_video(path)
-    if not path.is_dir() or any(row.reader.recognises(path) for row in FORMATS):
-        return False
     found = (file for folder in (path, path / "images") if folder.is_dir() for file in folder.iterdir())
     return any(file.suffix.lower() in (*SUFFIXES, *HEIF_SUFFIXES) or is_video(file) for file in found)
 

@@ -94,7 +94,7 @@ class Dataset:
         """At most ``most`` of the views, evenly chosen, the first and the last among them; the same images."""
         if len(self) <= most:
             return self
-        chosen = np.linspace(0, len(self) - 1, most).round().astype(int)
+        chosen = evenly(len(self), most)
         cameras, images, names = ([column[i] for i in chosen] for column in (self.cameras, self.images, self.names))
         masks = None if self.masks is None else [self.masks[i] for i in chosen]
         return replace(self, cameras=cameras, images=images, names=names, masks=masks)
@@ -111,7 +111,7 @@ class Dataset:
             top, left = (max(0, (full - size) // 2) for full in image.shape[:2])
             part = image[top : top + size, left : left + size]
             lens = camera.intrinsics.cropped(left, top, part.shape[1], part.shape[0])
-            cameras.append(replace(camera, intrinsics=lens))
+            cameras.append(camera.through(lens))
             images.append(part)
             mask = self.mask(i)
             masks.append(None if mask is None else mask[top : top + size, left : left + size])
@@ -169,6 +169,11 @@ class Dataset:
         if self.masks is None:
             return None
         return [None if mask is None else mask if k == 1 else mask_average(mask, k) for mask in self.masks]
+
+
+def evenly(n: int, most: int) -> list[int]:
+    """``most`` of n > 1 places in order, evenly chosen, the first and the last among them."""
+    return np.linspace(0, n - 1, most).round().astype(int).tolist()
 
 
 def _itself(image: UInt8) -> UInt8:

@@ -8,13 +8,13 @@ directions. forward: cameras that look one way. The last three are photographs, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.cameras.focus import Focus, focus_point
+from nerfvol.cameras.focus import Focus, focus_of
 from nerfvol.datasets.images import UInt8
 
 KINDS = ("object", "surroundings", "room", "forward")
@@ -144,7 +144,7 @@ def _doubts(cameras: Sequence[Camera], focus: Focus) -> list[str]:
         if (apart <= 1e-9).all():
             return [f"all {len(cameras)} poses are the same: were the cameras found at all?"]
         return ["all cameras stand at one point, as in a panorama: nothing tells how far away things are"]
-    inverse = focus_point([_inverted(camera) for camera in cameras])
+    inverse = focus_of(np.linalg.inv(poses).astype(np.float64, copy=False))
     meets = focus.certainty >= WELL_FIXED and focus.spread < 0.2
     if not (meets and focus.ahead >= LOOKS_IN) and (
         inverse.certainty >= WELL_FIXED and inverse.ahead >= 0.9 and inverse.spread < 0.1
@@ -160,6 +160,3 @@ def _doubts(cameras: Sequence[Camera], focus: Focus) -> list[str]:
         ]
     return []
 
-
-def _inverted(camera: Camera) -> Camera:
-    return replace(camera, c2w=np.linalg.inv(camera.c2w))

@@ -169,11 +169,12 @@ class MaskFinder:
             else:
                 found.append(MaskFile(mask))
         beside = self._beside.setdefault(path.parent, ImageFinder(path.parent))
-        for name in (f"dynamic_mask_{path.name}", f"dynamic_mask_{path.stem}"):
+        named_so = beside.mentions("mask")  # names of all that is looked for there
+        for name in (f"dynamic_mask_{path.name}", f"dynamic_mask_{path.stem}") if named_so else ():
             if (mask := beside.find(name)) is not None:
                 found.append(MaskFile(mask, black_is_out=False))
                 break
-        for name in _beside(path) if not found else ():
+        for name in _beside(path) if named_so and not found else ():
             if (mask := beside.find(name)) is not None and mask != path:
                 return (MaskFile(mask),)
         if not found:
@@ -244,6 +245,13 @@ class ImageFinder:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._listings: dict[Path, dict[str, Path]] = {}
+        self._mentions: dict[str, bool] = {}
+
+    def mentions(self, word: str) -> bool:
+        """Whether the name of any file of the folder itself has ``word``, in small letters, in it."""
+        if word not in self._mentions:
+            self._mentions[word] = any(word in name for name in self._names(self._folder))
+        return self._mentions[word]
 
     def find(self, listed: str) -> Path | None:
         """The file, or None if there is none.

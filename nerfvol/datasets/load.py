@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from nerfvol.cameras.camera import Camera
 from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.bounds import bounds_of_box, bounds_of_points, estimate_bounds, require_seen
-from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.dataset import Dataset, evenly
 from nerfvol.datasets.formats import SPLITS, find_format
 from nerfvol.datasets.frames import (
     View,
@@ -47,6 +47,8 @@ MOST_JUDGED = 24
 """Training pictures that the kind of scene is judged by, ..."""
 JUDGED_SIZE = 128
 """... at about so many pixels along the shorter side."""
+MOST_KEPT = 64 << 20
+"""Bytes of them that are kept whole until they are wanted so."""
 
 
 def load_dataset(
@@ -57,6 +59,7 @@ def load_dataset(
     threads: int | None = None,
     holdout: str = "own",
     scene: str = "auto",
+    most: int | None = None,
 ) -> Dataset:
     """Loads one split of a folder of posed images, whatever its format (docs/data.md).
 
@@ -70,6 +73,7 @@ def load_dataset(
         holdout: "own": the split is the files', or every 8th view is held out; "arc": neighbours among the views that would
             then train are held out together, for validation and test alike, and the others train.
         scene: what kind of scene it is, one of kinds.KINDS; "auto": by what pictures and cameras say.
+        most: views at most, evenly chosen, the first and the last among them; None: all.
 
     Raises:
         InputError: where the files cannot be used, in one sentence that names the file.
@@ -91,10 +95,12 @@ def load_dataset(
     frames = _present(listing, messages)
     training = [f for f in listing.training if f.path is not None] or frames
     views, training_views = views_of(frames, training, listing.source, messages, threads)
+    if most is not None and len(views) > most:
+        views = [views[i] for i in evenly(len(views), most)]
     cameras = [view.camera.scaled(downscale) for view in views]
     _require_memory(cameras, downscale)
     views = with_common_masks(views, training_views, messages)
-    judged = _sample(training_views, threads)
+    judged, sampled = _sample(training_views, threads)
     views, circles = with_circles(views, judged, messages)
     judged = [(replace(view, circle=circles.get(view.camera.intrinsics)), picture) for view, picture in judged]
     evidence = look([picture for _, picture in judged], [_seen_small(view, picture) for view, picture in judged])
@@ -104,7 +110,7 @@ def load_dataset(
     cut_out = decision.kind != "object"
 
     def decode() -> tuple[list[UInt8], list[UInt8 | None]]:
-        made = map_threads(lambda view: _decoded(view, downscale, cut_out), views, threads)
+        made = map_threads(lambda view: _decoded(view, sampled.get(view.path), downscale, cut_out), views, threads)
         return _settle_alpha([image for image, _ in made], listing.source), [mask for _, mask in made]
 
     try:
@@ -113,6 +119,8 @@ def load_dataset(
         views = _readable(views, messages, threads)
         cameras = [view.camera.scaled(downscale) for view in views]
         images, masks = decode()
+    for picture in sampled.values():
+        picture.take()
     require_seen(bounds, cameras)
     messages += _on_masks(views, masks, images)
     store = ImageStore(len(images), lambda: decode()[0], images)
@@ -160,29 +168,46 @@ def _scene_of(
     return bounds, decision, said
 
 
+@dataclass(eq=False)
+class _Sampled:
+    """A picture to look at, small, and the whole one until it is taken, as both came from the file."""
+
+    small: UInt8
+    whole: UInt8 | None
+
+    def take(self) -> UInt8 | None:
+        """The whole picture, once."""
+        whole, self.whole = self.whole, None
+        return whole
+
+
 @functools.lru_cache(maxsize=MOST_JUDGED)
-def _small(path: Path, changed: int, size: int) -> UInt8:
-    """A picture to look at. Every split of a scene is judged by the same ones: they are decoded once while their files stay
-    as they are."""
-    return read_small(path, JUDGED_SIZE)
+def _sampled(path: Path, changed: int, size: int) -> _Sampled:
+    """Every split of a scene is judged by the same pictures: they are decoded once while their files stay as they are."""
+    small, whole = read_small(path, JUDGED_SIZE)
+    # Where the picture itself is small enough it is what is looked at: it would stay for as long as that does.
+    kept = whole is not None and whole is not small and whole.nbytes <= MOST_KEPT // MOST_JUDGED
+    return _Sampled(small, whole if kept else None)
 
 
-def _sample(views: Sequence[View], threads: int | None) -> list[tuple[View, UInt8]]:
-    """A few training views with their pictures, small: what the kind of scene is judged by."""
+def _sample(views: Sequence[View], threads: int | None) -> tuple[list[tuple[View, UInt8]], dict[Path, _Sampled]]:
+    """A few training views with their pictures, small, by which the kind of scene is judged; and these as their files have
+    them, with what was decoded whole."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, MOST_JUDGED).round().astype(int))]
 
-    def small(view: View) -> UInt8 | InputError:
+    def small(view: View) -> _Sampled | InputError:
         try:
             state = view.path.stat()
-            return turned(_small(view.path, state.st_mtime_ns, state.st_size), view.orientation)
+            return _sampled(view.path, state.st_mtime_ns, state.st_size)
         except InputError as error:
             return error
 
-    pictures = map_threads(small, chosen, threads)
-    wrong = [picture for picture in pictures if isinstance(picture, InputError)]
-    if len(wrong) == len(pictures):
+    found = list(zip(chosen, map_threads(small, chosen, threads), strict=True))
+    wrong = [error for _, error in found if isinstance(error, InputError)]
+    if len(wrong) == len(found):
         raise wrong[0]
-    return [(v, p) for v, p in zip(chosen, pictures, strict=True) if not isinstance(p, InputError)]
+    good = [(view, sampled) for view, sampled in found if isinstance(sampled, _Sampled)]
+    return [(view, turned(s.small, view.orientation)) for view, s in good], {view.path: s for view, s in good}
 
 
 def _seen_small(view: View, picture: UInt8) -> NDArray[np.bool_] | None:
@@ -196,9 +221,11 @@ def _seen_small(view: View, picture: UInt8) -> NDArray[np.bool_] | None:
     return mask[rows[:, None], columns] > 127
 
 
-def _decoded(view: View, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
-    """A view's image and mask at its final size."""
-    image, mask = read_pixels(view.path, view.orientation), view.seen()
+def _decoded(view: View, sampled: _Sampled | None, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
+    """A view's image and mask at its final size; of ``sampled`` where that has it whole."""
+    whole = None if sampled is None else sampled.take()
+    image = read_pixels(view.path, view.orientation) if whole is None else turned(whole, view.orientation)
+    mask = view.seen()
     lens = view.camera.intrinsics
     if image.shape[:2] != (lens.height, lens.width):
         raise InputError(f"{view.path}: the image is not of the size its header declares")

@@ -74,7 +74,7 @@ class Photographs:
         self._threads = dataset.threads if threads is None else threads
         self._levels: dict[int, dict[int, TrainingView]] = {}
         canvases = {lens: canvas_of(lens, max_angle) for lens in {c.intrinsics for c in dataset.cameras}}
-        self.cameras = [Camera(canvases[c.intrinsics].camera, c.c2w) for c in dataset.cameras]
+        self.cameras = [c.through(canvases[c.intrinsics].camera) for c in dataset.cameras]
         grids = {lens: source_grid(canvas, lens) for lens, canvas in canvases.items() if not is_pinhole(lens)}
         over = background if alpha == "background" else None
 
@@ -177,7 +177,7 @@ class Photographs:
         width, height = (-(-n // factor) for n in (camera.intrinsics.width, camera.intrinsics.height))
         size = (lens.height, lens.width)
         image = source if factor == 1 and source.shape == (*size, 4) else reduce(source, factor, size)
-        return TrainingView(image, replace(camera, intrinsics=lens), width, height)
+        return TrainingView(image, camera.through(lens), width, height)
 
 
 def check_factor(factor: int) -> None:

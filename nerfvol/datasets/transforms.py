@@ -6,11 +6,16 @@ camera-to-world ``transform_matrix`` in OpenGL axes. Formats and sources: docs/d
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerfvol.cameras.calibration import CALIBRATION_KEYS, finite_number, read_calibration, read_matrix
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.cameras.calibration import CALIBRATION_KEYS, Calibration, finite_number, read_calibration, read_matrix
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.formats import SPLITS
 from nerfvol.datasets.listing import Frame, ImageFinder, Listing, MaskFinder, Poses, hold_out, named
@@ -127,15 +132,15 @@ class _File:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        data = _load_json(path)
+        stated = _stated(path)
+        data, poses = stated.data, stated.poses
         self.lists = _named_splits(data, path)
-        finder, masks, poses = ImageFinder(path.parent), MaskFinder(path.parent), Poses(path)
-        shared = {key: value for key, value in data.items() if key != "frames"}
+        finder, masks = ImageFinder(path.parent), MaskFinder(path.parent)
         self.frames = []
-        for number, entry in enumerate(data["frames"]):
-            frame = _frame(f"{path}, frame {number}", entry, shared, finder, masks, poses)
-            if frame is not None:
-                self.frames.append(frame)
+        for entry in stated.entries:
+            image = finder.find(entry.listed)
+            mask = masks.of(entry.listed, image, entry.mask)
+            self.frames.append(Frame(entry.listed, image, entry.c2w, entry.calibration, mask, entry.light))
         try:
             self.hint = _hint(data)
         except InputError as error:
@@ -155,12 +160,56 @@ class _File:
         return any(frame.path is not None for frame in self.frames)
 
 
-def _frame(
-    where: str, entry: Any, shared: Mapping[str, Any], finder: ImageFinder, masks: MaskFinder, poses: Poses
-) -> Frame | None:
-    """The frame of an entry; None where its pose was lost."""
-    if not isinstance(entry, dict):
-        raise InputError(f"{where}: expected an object with file_path and transform_matrix, got {shown(entry):.60}")
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """A frame as the file states it: the picture's name, pose (4, 4), calibration, and what it names as mask and light."""
+
+    listed: str
+    c2w: NDArray[np.float64]
+    calibration: Calibration
+    mask: str | None
+    light: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Stated:
+    """What a file says, whatever else is on the disk: all of it, its entries that have a pose, and what became of poses."""
+
+    data: dict[str, Any]
+    entries: list[_Entry]
+    poses: Poses
+
+
+def _stated(path: Path) -> _Stated:
+    """The file's content; every split of a folder reads it, and it is understood once while the file stays as it is."""
+    try:
+        state = path.stat()
+    except OSError:
+        return _understood.__wrapped__(path, 0, 0)  # its sentence says what is wrong
+    return _understood(path, state.st_mtime_ns, state.st_size)
+
+
+@functools.lru_cache(maxsize=3)
+def _understood(path: Path, changed: int, size: int) -> _Stated:
+    data, poses, entries = _load_json(path), Poses(path), []
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    common: Calibration | None = None
+    for number, entry in enumerate(data["frames"]):
+        where = f"{path}, frame {number}"
+        if not isinstance(entry, dict):
+            raise InputError(f"{where}: expected an object with file_path and transform_matrix, got {shown(entry):.60}")
+        own = not CALIBRATION_KEYS.isdisjoint(entry)
+        found = _entry(where, entry, shared, poses, None if own else common)
+        if found is not None:
+            common = common if own else found.calibration
+            entries.append(found)
+    return _Stated(data, entries, poses)
+
+
+def _entry(
+    where: str, entry: dict[str, Any], shared: Mapping[str, Any], poses: Poses, calibration: Calibration | None
+) -> _Entry | None:
+    """The entry, with ``calibration`` where that is known; None where its pose was lost."""
     listed = entry.get("file_path")
     if not isinstance(listed, str) or not listed or "\0" in listed:
         raise InputError(f"{where}: expected file_path to name an image, got {shown(listed):.60}")
@@ -173,14 +222,12 @@ def _frame(
         raise InputError(f"{where}: expected mask_path to name an image, got {shown(mask):.60}")
     try:
         c2w = poses.read(listed, read_matrix(entry["transform_matrix"]))
-        calibration = read_calibration(everything)
+        calibration = calibration or read_calibration(everything)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    if c2w is None:
-        return None
-    path, light = finder.find(listed), everything.get("light")
+    light = everything.get("light")
     light = light if isinstance(light, str) and light else None
-    return Frame(listed, path, c2w, calibration, masks.of(listed, path, mask or None), light)
+    return None if c2w is None else _Entry(listed, c2w, calibration, mask or None, light)
 
 
 LONGEST_NAME = 200

@@ -34,8 +34,11 @@ COARSE_STEPS = ((64, 4), (256, 2))
 """Until so many steps are done, steps along rays are so many times longer: all cells are occupied then."""
 SWEEPS = (64, 128, 256)
 """After so many steps the whole region is looked at, one point a block of 2**3 cells ..."""
-PROBE_EVERY, PROBES = 32, 32768
-"""... and from then on, each so many steps, so many cells, half of them among the occupied ones."""
+THINNED, THIN_DECAY = (300, 340, 380, 420, 460, 500, 600, 700, 850, 1000, 1300, 1600, 2000, 3000, 5000), 0.5
+"""... after so many, every occupied cell, and what was seen of it before counts by this factor: haze of the first steps would
+stay occupied for thousands of steps, and be half of the samples; ..."""
+PROBE_EVERY, PROBES = 64, 32768
+"""... and from the sweeps on, each so many steps, so many cells, half of them among the occupied ones."""
 SLOW_LEVELS, SLOW_EVERY = 3, 2
 """Levels of the grid from this one on are moved at every second step, by the gradient of both: half the work of Adam."""
 NETWORK_DECAY = 1e-6
@@ -236,6 +239,9 @@ class CompiledFieldTrainer:
             seen = self._seen(low, 2)
             for offset in np.ndindex(2, 2, 2):
                 grid.note(low + (offset[0] * r + offset[1]) * r + offset[2], seen)
+        elif self.steps_done in THINNED:
+            held = np.flatnonzero(grid.cells().reshape(-1))
+            grid.note(held, self._seen(held, 1), THIN_DECAY)
         elif self.steps_done > SWEEPS[-1] and self.steps_done % PROBE_EVERY == 0:
             rng = self._rng()
             held = np.flatnonzero(grid.cells().reshape(-1))

@@ -146,19 +146,19 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
     Raises:
         InputError: the data cannot be used, or there is nothing in the images.
     """
+    training = load_dataset(
+        config.data, "train", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene
+    )
     started = time.perf_counter()
     held_out = load_dataset(
-        config.data, "val", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene
-    ).evenly(LARGEST_HELD_OUT)
+        config.data, "val", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene, most=LARGEST_HELD_OUT
+    )
     first = held_out.evenly(1)
     compared = held_out.evenly(config.compare_views).middles(COMPARED_SIZE)
     reading = 0.0
     if held_out.nbytes > HELD_OUT_KEPT:  # else released until they are scored
         held_out.release()
         reading = time.perf_counter() - started
-    training = load_dataset(
-        config.data, "train", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene
-    )
     for message in training.messages:
         say(message)
     others = [message for message in held_out.messages if message not in training.messages]

@@ -42,7 +42,11 @@ from nerfvol.views import OctreeModel, SplatModel
 RESERVE_SHARE = 0.2
 """Of a time budget, the most that is kept for writing and scoring."""
 EXPECTED_SECONDS_TO_WRITE = 2.0
-"""Before there is a representation that tells."""
+"""Of an octree, before there is one that tells ..."""
+SECONDS_TO_WRITE = 0.5
+"""... and of all else."""
+PREVIEW_SHARE, PREVIEW_SECONDS = 0.01, 0.08
+"""Of a time budget, what previews may take together; and for the first one, before it was measured."""
 TABLE_SECONDS = 0.008
 """For a training photograph's row in the table of photographs, besides its small picture."""
 LOOK_AGAIN = 0.08
@@ -144,6 +148,7 @@ class Run:
         self._looked, self._size_then = self.clock.elapsed(), ""
         self._last_save = time.perf_counter()
         self._warned: set[str] = set()
+        self._previewed, self._preview_cost = 0.0, PREVIEW_SECONDS  # seconds, of all and of the last
 
     def enter(self, phase: Phase) -> None:
         """Begin the phase, or go on inside it where the checkpoint was written in it.
@@ -293,7 +298,11 @@ class Run:
             self.data.training.release()
 
     def preview(self, phase: Phase, moment: float) -> None:
-        """The first held-out view, small: truth next to what the phase has."""
+        """The first held-out view, small: truth next to what the phase has. A time budget is for training: what previews may
+        take of it is bounded."""
+        budget, started = self.config.time_budget, time.perf_counter()
+        if budget is not None and self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
+            return
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
         truth = np.divide(composite_average(image, self.background, k), 255, dtype=np.float32)
@@ -303,6 +312,8 @@ class Run:
             pictures.write_png(path, picture)
         except InputError as error:
             self.warn(f"{error}; the run goes on without this preview")
+        self._preview_cost = time.perf_counter() - started
+        self._previewed += self._preview_cost
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
@@ -366,19 +377,22 @@ class Run:
         image = self.data.first.composited(0, self.background)
         ssim(image, image)
         scoring = (time.perf_counter() - started) / ops.get_threads()  # so many views are scored side by side
-        rendering = 0.1e-6 * image.size / 3
+        rows = len(self.data.training) if self.data.training.scene.is_unbounded else 0
         small = 0.0
-        if phase is not None:
+        if phase is None:
+            rendering = 0.1e-6 * image.size / 3
+            writing = EXPECTED_SECONDS_TO_WRITE if self.config.representation == "octree" else SECONDS_TO_WRITE
+        else:
             rendering = _seconds(phase.picture, self.data.held_out.cameras[0])
-            if self.data.training.scene.is_unbounded:
+            writing = phase.seconds_to_write()
+            if rows:
                 camera = self.data.training.cameras[0]
                 lens = camera.intrinsics
                 small = _seconds(phase.picture, camera.scaled(fitting_factor(lens.width, lens.height)))
-        writing = EXPECTED_SECONDS_TO_WRITE if phase is None else phase.seconds_to_write()
         return min(
             writing
             + self.data.reading
-            + (TABLE_SECONDS + small) * len(self.data.training)
+            + (TABLE_SECONDS + small) * rows
             + 1.1 * len(self.data.held_out) * (scoring + rendering + FIT_SECONDS * self.config.refine_poses),
             RESERVE_SHARE * self.config.time_budget,
         )

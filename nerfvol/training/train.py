@@ -15,13 +15,12 @@ import contextlib
 import copy
 import dataclasses
 import functools
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from tqdm import tqdm
 
 from nerfvol import __version__
 from nerfvol.config.training import FINEST_LEVEL, Config
@@ -364,10 +363,27 @@ def _counts(model: Model) -> dict[str, int]:
     return {name: described[name] for name in ("leaves", "vertices", "splats", "parameters") if name in described}
 
 
-def progress_bar(name: str, done: float) -> tqdm[Any]:
+def progress_bar(name: str, done: float) -> Any:
     """A bar from 0 to 1 with an estimate of the time left; nothing where the output is no terminal."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        return _NoBar()
+    from tqdm import tqdm  # what it imports takes as long as a tenth of the training of a few seconds
+
     shape = "{desc} {percentage:3.0f}% |{bar:20}| {elapsed}<{remaining} {postfix}"
     return tqdm(total=1.0, initial=done, desc=name, bar_format=shape, smoothing=0.05, disable=None)
+
+
+class _NoBar(contextlib.AbstractContextManager["_NoBar"]):
+    """What :func:`optimise` asks of a bar, without one."""
+
+    def __exit__(self, *failure: object) -> None:
+        pass
+
+    def set_postfix_str(self, text: str, refresh: bool = True) -> None:
+        """Nothing."""
+
+    def update(self, more: float) -> None:
+        """Nothing."""
 
 
 def summary(scores: dict[str, Any]) -> dict[str, Any]:

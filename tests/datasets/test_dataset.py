@@ -82,7 +82,7 @@ def test_pictures_that_the_kind_of_scene_is_judged_by_are_decoded_once_for_all_s
     write_scene(tmp_path, {"train": 5, "val": 2}, size=20)
     read, asked = load.read_small, []
     monkeypatch.setattr(load, "read_small", lambda path, size: asked.append(path.name) or read(path, size))
-    load._small.cache_clear()
+    load._sampled.cache_clear()
     for split in ("train", "val", "train"):
         kind = load_dataset(tmp_path, split).kind
     assert sorted(asked) == [f"r_{i}.png" for i in range(5)] and kind == "object"

@@ -62,10 +62,11 @@ def test_learns_the_ball(compiled, dataset: Dataset) -> None:
 
 
 def test_the_same_bits_with_any_number_of_threads_and_resumed(threads, dataset: Dataset, tmp_path: Path) -> None:
-    """Across the first sweep (step 64) and a round of probes, occupancy included; stopped through a checkpoint file."""
+    """Across sweeps, a round of probes and a thinning, occupancy included; stopped through a checkpoint file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compiled_field, "SWEEPS", (8, 16))
         patch.setattr(compiled_field, "PROBE_EVERY", 8)
+        patch.setattr(compiled_field, "THINNED", (21,))
         runs = []
         for n in (1, 2, 3):
             threads(n)
@@ -81,6 +82,19 @@ def test_the_same_bits_with_any_number_of_threads_and_resumed(threads, dataset: 
     for other in (*runs[1:], second):
         assert_same_bits(runs[0], other)
     assert trainer_of(dataset, seed=2).step().loss != reports[0]
+
+
+def test_haze_that_is_gone_does_not_stay_occupied(compiled, dataset: Dataset) -> None:
+    """A thinning looks at every occupied cell and at no other: what was remembered halves where nothing is left."""
+    trainer = trainer_of(dataset)
+    trainer.state.network[-13] = -8.0  # nearly empty everywhere: e^-9 a unit
+    grid, half = trainer.occupancy, len(trainer.occupancy.sigmas) // 2
+    grid.sigmas[:half], grid.sigmas[half:] = 100.0, 1e-3
+    grid.refresh()
+    assert grid.cells().reshape(-1)[:half].all() and not grid.cells().reshape(-1)[half:].any()
+    trainer.steps_done = compiled_field.THINNED[0] - 1
+    trainer.step()
+    assert (grid.sigmas[:half] == 50.0).all() and (grid.sigmas[half:] == np.float32(1e-3)).all()
 
 
 def test_a_checkpoint_of_another_network_is_refused(compiled, dataset: Dataset) -> None:

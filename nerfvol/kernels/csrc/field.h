@@ -16,7 +16,9 @@ constexpr int kFieldLayers = 11;     // trunk of up to 8, head, two of colour
 constexpr int kFieldGroups = 16;     // ranges of rays, each with a gradient of its own: sums have one order
 constexpr int kFieldBrick = 16;      // entries of a brick of 2 x 2 x 4 vertices
 constexpr int kFieldChunk = 128;     // rays that march together
-constexpr int kFieldWave = 8;        // samples of a ray between two looks at its transmittance
+constexpr int kFieldWave = 4;        // samples of a ray between two looks at its transmittance, ...
+constexpr int kFieldFew = 128;       // ... so many of all rays together where that is more, but ...
+constexpr int kFieldLongest = 16;    // ... not more than this of one
 
 enum FieldExtra { kNothing = 0, kPosition = 1, kDirection = 2 };
 

@@ -86,6 +86,27 @@ inline ChunkLoss adjoint(const Chunk& c, const FieldRays& rays, int64_t from, co
     return sum;
 }
 
+// Takes what lies behind the end of its ray out of the chunk, in place: a third of its samples, which have no part in anything.
+inline void drop_unused(Chunk& c, SampleGradients& d) {
+    const int rows = encoded_rows(c.f), before = c.samples;
+    int to = 0;
+    const auto move = [&](int s, bool counts) {
+        const auto at = [](int sample, int of, int row) { return (std::size_t(sample / kLanes * of) + std::size_t(row)) * kLanes + std::size_t(sample % kLanes); };
+        for (int i = 0; i < rows && s != to; ++i) c.encoded[at(to, rows, i)] = c.encoded[at(s, rows, i)];
+        for (int k = 0; k < 3; ++k) {
+            c.position[at(to, 3, k)] = c.position[at(s, 3, k)];
+            c.colour[at(to, 3, k)] = c.colour[at(s, 3, k)];
+            d.colour[at(to, 3, k)] = counts ? d.colour[at(s, 3, k)] : 0.0f;
+        }
+        d.raw[std::size_t(to)] = counts ? d.raw[std::size_t(s)] : 0.0f;
+        c.ray[to++] = c.ray[s];
+    };
+    for (const Segment& segment : c.segments)
+        for (int s = segment.start; s < segment.start + segment.count; ++s) move(s, true);
+    for (const int last = to - 1; to % (2 * kLanes) && to < before;) move(last, false);  // whole pairs of packets
+    c.samples = to;
+}
+
 // The network again, block by block, and backwards; `encoding` gets the gradient of the encoding, packets of
 // (features, 16) for each level, or null.
 inline void network_adjoint(Chunk& c, const SampleGradients& d, float* sums, float* encoding) {

@@ -69,8 +69,9 @@ public:
             const int base = samples;
             const std::size_t first = segments.size();
             int kept = 0;
+            const int wave = wave_of(alive);
             for (int i = 0; i < alive; ++i)
-                if (take(live[i])) live[kept++] = live[i];
+                if (take(live[i], wave)) live[kept++] = live[i];
             alive = kept;
             if (samples == base) break;
             fill_up();
@@ -162,12 +163,18 @@ private:
         weight[s] = 0;
     }
 
+    // Samples of each of `alive` rays: few, for most rays end within the first ones they meet; more where a wave of few rays
+    // would be mostly what fills its packets up.
+    static int wave_of(int alive) {
+        return std::min(std::max(nerfvol::kFieldWave, nerfvol::kFieldFew / alive), nerfvol::kFieldLongest);
+    }
+
     // The next samples of a ray, one wave's; false where there are none.
-    bool take(int r) {
-        reserve(samples + nerfvol::kFieldWave + 2 * kLanes);
+    bool take(int r, int wave) {
+        reserve(samples + wave + 2 * kLanes);
         uint64_t* words = bits(r);
         const int start = samples;
-        int left = nerfvol::kFieldWave;
+        int left = wave;
         for (int w = 0; w < marcher_.words() && left; ++w)
             for (; words[w] && left; --left, words[w] &= words[w] - 1) {
                 const int k = 64 * w + __builtin_ctzll(words[w]);

@@ -124,6 +124,7 @@ private:
         losses_[number] = adjoint(chunk, rays, from, loss, gradients);
         counts_[2 * number] = chunk.samples;
         counts_[2 * number + 1] = chunk.used;
+        drop_unused(chunk, gradients);
         float* encoding = nullptr;
         if (f.hashed) encoding = static_cast<float*>(arena.take(std::size_t(chunk.samples) * std::size_t(f.encoded) * sizeof(float)));
         network_adjoint(chunk, gradients, sums, encoding);
