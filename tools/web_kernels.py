@@ -23,7 +23,7 @@ UNITS = (
     "web.cpp",
     "web_octree.cpp",
     "web_splats.cpp",
-    "inflate.cpp",
+    "web_inflate.cpp",
     "web_pool.cpp",
     "prefilter.cpp",
     "topology.cpp",

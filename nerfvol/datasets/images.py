@@ -24,7 +24,6 @@ from nerfvol.cameras.warp import reduce
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
 from nerfvol.machine import usable_cores
-from nerfvol.native import native
 
 UInt8 = NDArray[np.uint8]
 Item = TypeVar("Item")
@@ -185,28 +184,8 @@ def read_image(path: Path, orientation: int = 1) -> UInt8:
 
 def read_pixels(path: Path, orientation: int = 1) -> UInt8:
     """As :func:`read_image`, but the array may refuse writing: what is averaged next need not be copied."""
-    pixels = _plain_png(path)
-    if pixels is not None:
-        return turned(pixels, orientation)
     with _opened(path) as image:
         return turned(_pixels(image, path), orientation)
-
-
-def _plain_png(path: Path) -> UInt8 | None:
-    """The pixels (h, w, 3 or 4) of a PNG of the plain kind, in a third of Pillow's time; None where it is another file, or
-    anything is wrong with it: Pillow says what."""
-    compiled = native()
-    if compiled is None or path.suffix.lower() != ".png":
-        return None
-    try:
-        file = path.read_bytes()
-    except OSError:
-        return None
-    shape = compiled.png_size(file)
-    if not 0 < shape[0] * shape[1] <= MAX_PIXELS:
-        return None
-    pixels = np.empty(shape, np.uint8)
-    return pixels if compiled.decode_png(file, pixels) else None
 
 
 def writeable(image: UInt8) -> UInt8:
@@ -217,15 +196,11 @@ def writeable(image: UInt8) -> UInt8:
 def read_small(path: Path, size: int) -> tuple[UInt8, UInt8 | None]:
     """As :func:`read_image`, reduced by a whole factor so that about ``size`` pixels are left along it: to look at; and the
     picture itself, which may refuse writing, where it was decoded whole."""
-    whole = _plain_png(path)
-    if whole is None:
-        with _opened(path) as image:
-            factor = max(1, min(image.size) // size)
-            image.draft(None, (image.width // factor, image.height // factor))  # JPEG alone can; others ignore it
-            pixels = _pixels(image, path)
-            whole = None if image.format == "JPEG" else pixels
-    else:
-        pixels = whole
+    with _opened(path) as image:
+        factor = max(1, min(image.size) // size)
+        image.draft(None, (image.width // factor, image.height // factor))  # JPEG alone can; others ignore it
+        pixels = _pixels(image, path)
+        whole = None if image.format == "JPEG" else pixels
     return area_average(pixels, max(1, min(pixels.shape[:2]) // size)), whole
 
 

@@ -10,7 +10,6 @@
 #include <vector>
 
 #include "neighbours.h"
-#include "png.h"
 #include "sweep.h"
 #include "warp.h"
 
@@ -91,20 +90,6 @@ void py_reduce(In<uint8_t, nb::ndim<3>> source, int64_t factor, Out<uint8_t, nb:
     reduce(from, factor, int64_t(out.shape(0)), int64_t(out.shape(1)), out.data());
 }
 
-// The size (height, width, channels) of a plain PNG file; zeros for any other.
-auto py_png_size(nb::bytes file) {
-    const PngSize size = png_size(static_cast<const uint8_t*>(file.data()), int64_t(file.size()));
-    return nb::make_tuple(size.height, size.width, size.channels);
-}
-
-bool py_decode_png(nb::bytes file, Out<uint8_t, nb::ndim<3>> out) {
-    const PngSize size{int64_t(out.shape(0)), int64_t(out.shape(1)), int(out.shape(2))};
-    const auto* bytes = static_cast<const uint8_t*>(file.data());
-    const auto n = int64_t(file.size());
-    nb::gil_scoped_release release;
-    return decode_png(bytes, n, size, out.data());
-}
-
 void py_sample(In<float, nb::ndim<3>> picture, In<float, nb::shape<-1, 2>> positions, bool cubic, Out<float, nb::ndim<2>> out) {
     require(picture.shape(0) > 0 && picture.shape(1) > 0, "the picture is empty");
     require(out.shape(0) == positions.shape(0) && out.shape(1) == picture.shape(2), "the output does not fit");
@@ -131,8 +116,6 @@ void bind_photographs(nb::module_& m) {
           "inverse_depth"_a, "score"_a, "rival"_a);
     m.def("remap", &py_remap, "source"_a, "grid"_a, "step"_a, "used_height"_a, "used_width"_a, "out"_a);
     m.def("reduce", &py_reduce, "source"_a, "factor"_a, "out"_a);
-    m.def("png_size", &py_png_size, "file"_a);
-    m.def("decode_png", &py_decode_png, "file"_a, "out"_a);
     m.def("sample", &py_sample, "picture"_a, "positions"_a, "cubic"_a, "out"_a);
     m.def("nearest", &py_nearest, "points"_a, "queries"_a.none(), "squared"_a, "index"_a);
 }

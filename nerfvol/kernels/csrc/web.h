@@ -6,7 +6,6 @@
 #include <new>
 #include <vector>
 
-#include "inflate.h"
 #include "tree.h"
 
 // Only functions marked so leave the module.
@@ -41,6 +40,9 @@ void draw_octree(int row);
 void draw_splats(int row);
 void prepare_splats(int first, int last);
 bool splats_are_open();
+
+// The zlib stream `from` as exactly n bytes; false where it is damaged or holds more or fewer.
+bool inflate(const uint8_t* from, int64_t n_from, uint8_t* to, int64_t n);
 
 // Calls use(i, code) with the n numbers that a channel's two byte planes hold (nerfvol/octree/codec.py).
 template <class Use> inline void unpack_codes(const uint8_t* low, const uint8_t* high, int64_t n, bool differences, const Use& use) {
