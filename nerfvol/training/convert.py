@@ -32,6 +32,7 @@ from nerfvol.splats.splats import Splats
 from nerfvol.starts.field import distill
 from nerfvol.starts.leaves import PIXELS, octree_around
 from nerfvol.starts.subject import subject_of
+from nerfvol.starts.surfaces import Seen, write_surfaces
 from nerfvol.starts.surfels import surfels
 from nerfvol.starts.visible import judged_downscale, largest_weights
 from nerfvol.training.octree_trainer import OctreeTrainer
@@ -44,8 +45,10 @@ MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
 FITTED_VIEWS = 100
 """Pictures of the splats that their octree is fitted to, at most."""
-FITTED_STEPS = 400
-"""Steps of the fit: a few seconds on two cores."""
+FITTED_STEPS, FITTED_STEPS_OF_OBJECTS = 400, 240
+"""Steps of the fit: a few seconds on two cores. Objects begin with their surfaces found (starts/surfaces.py)."""
+LOOKS = 16
+"""Of these, those that tell surfaces from the free before the fit."""
 FITTED_PIXELS = 400
 """Longer side, at most, of these pictures; of larger cameras a whole fraction."""
 VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
@@ -116,11 +119,26 @@ def octree_of(
     """
     level = finest_level(seen) if level is None else level
     octree = octree_around(splats, seen.scene, seen.cameras, level)
-    config = OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT)
+    if not seen.scene.is_unbounded:
+        write_surfaces(octree, looked_at(SplatModel(splats), seen.cameras, background))
+    steps = FITTED_STEPS if seen.scene.is_unbounded else min(FITTED_STEPS, FITTED_STEPS_OF_OBJECTS)
+    config = OctreeConfig(levels=[level], steps=steps, **FIT)
     trainer = OctreeTrainer(seen, background, config, seed, octree)
-    for step in range(FITTED_STEPS):
-        trainer.step(step / FITTED_STEPS)
+    for step in range(steps):
+        trainer.step(step / steps)
     return trainer.octree
+
+
+def looked_at(model: Model, cameras: Sequence[Camera], background: Sequence[float]) -> list[Seen]:
+    """What LOOKS of ``cameras``, evenly chosen, see of a model, with distances."""
+    views = []
+    for i in np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), LOOKS)).round().astype(int)):
+        image = model.render(cameras[i], background, ("rgb", "opacity", "median_depth"))
+        opacity = image["opacity"]
+        through = (1 - opacity)[..., None] * np.asarray(background, np.float32)
+        rgb = (image["rgb"] - through) / np.maximum(opacity, 1 / 255)[..., None]
+        views.append(Seen(cameras[i], rgb, opacity, image["median_depth"]))
+    return views
 
 
 def octree_of_field(

@@ -49,7 +49,7 @@ FEWEST_STEPS = 5000
 """Before a run with a time budget may end early, however few its tiles."""
 SECONDS_TO_WRITE = 0.5
 """... and read an octree, and to look at it; plus, a vertex, ..."""
-PACKED_TIMES, PACKED_SAMPLE = 6.0, 50_000
+PACKED_TIMES, PACKED_SAMPLE = 8.0, 50_000
 """... so many times what packing it takes, as measured on so many vertices: the last pruning, packing, reading and
 prefiltering of a fox of 1.2 million leaves took 17.6 CPU seconds, its packing about 3."""
 WORTH_PRUNING = 0.05
