@@ -20,6 +20,7 @@ from data_synth.errors import InputError
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.noise import CloudTextures, cloud_textures, remap
 
+RIM = 0.9  # width of a rim, soft so that detail can erode it
 LARGEST = 4096  # pixels along a side of a map
 
 
@@ -80,7 +81,7 @@ def _fill(t, detail, weather, tiles, cloud, rain, first, last):
             cover, kind, wet = weather_at(weather, x, y, 0), weather_at(weather, x, y, 1), weather_at(weather, x, y, 2)
             for k in range(nz):
                 z = k / (nz - 1)
-                shape = shape_at(t, mixed_gradient(kind, z), cover, tiles[0] * x, tiles[1] * y, tiles[2] * z)
+                shape = shape_at(t, mixed_gradient(kind, z), cover, RIM, tiles[0] * x, tiles[1] * y, tiles[2] * z)
                 cloud[i, j, k] = eroded(detail, shape, x, y, z)
                 rain[i, j, k] = wet * remap(z, 0.15, 0.75, 1.0, 0.0)
 
