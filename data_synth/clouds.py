@@ -1,7 +1,7 @@
 """Cloud densities after [Horizon] (Schneider & Vos 2015), PHYSICS 13.
 
 base   = remap(Perlin-Worley, low-frequency Worley - 1 -> 1, 0 -> 1), its contrast stretched, x height gradient
-shape  = remap(base, 1 - coverage -> 1.3 - coverage, 0 -> 1)
+shape  = remap(base, 1 - coverage -> 1 - coverage + width, 0 -> 1)
 final  = the shape eroded by finer noise (``detail.py``): once, at the samples of a grid, or wherever a ray asks for it
 
 Coverage and type come from a single cloud's footprint, or over a landscape from a weather map (``weather.py``).
@@ -21,6 +21,7 @@ from data_synth.jit import in_bands, jit, kernel
 from data_synth.noise import CloudTextures, cloud_textures, remap, texture_at
 
 STRATUS, CUMULUS, CUMULONIMBUS = range(3)
+RIM = 0.3  # width of a single cloud's rim
 DETAIL_TILES = 5.0  # of the detail noise for one of the base noise
 TYPES = {"stratus": STRATUS, "cumulus": CUMULUS, "cumulonimbus": CUMULONIMBUS}
 
@@ -49,8 +50,8 @@ def footprint(kind, x, y, h, coverage):
 
 
 @jit
-def shape_at(t, gradient, cover, x, y, z):
-    """The cloud's shape in [0, 1]; x, y, z in tiles of the base noise."""
+def shape_at(t, gradient, cover, width, x, y, z):
+    """The cloud's shape in [0, 1]; x, y, z in tiles of the base noise. width: of the rim, in the base noise."""
     if gradient <= 0.0 or cover <= 0.0:
         return 0.0
     low = (
@@ -60,7 +61,7 @@ def shape_at(t, gradient, cover, x, y, z):
     )
     base = remap(texture_at(t.base, x, y, z, 0), low - 1.0, 1.0, 0.0, 1.0)
     base = remap(base, 0.52, 0.92, 0.0, 1.0) * gradient
-    return remap(base, 1.0 - cover, 1.3 - cover, 0.0, 1.0)
+    return remap(base, 1.0 - cover, 1.0 + width - cover, 0.0, 1.0)
 
 
 @kernel
@@ -71,7 +72,7 @@ def _fill(t, detail, kind, coverage, frequency, out, first, last):
             for k in range(nz):
                 x, y, z = i / (nx - 1), j / (ny - 1), k / (nz - 1)
                 gradient, cover = height_gradient(kind, z), footprint(kind, x, y, z, coverage)
-                shape = shape_at(t, gradient, cover, frequency * x, frequency * y, frequency * z)
+                shape = shape_at(t, gradient, cover, RIM, frequency * x, frequency * y, frequency * z)
                 out[i, j, k] = eroded(detail, shape, x, y, z)
 
 

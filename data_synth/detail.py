@@ -21,6 +21,7 @@ from data_synth.checks import vector
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.noise import CloudTextures, remap, texture_at
+from data_synth.vec import bilinear
 
 CURL_TILES = 4.0  # of the curl noise along the box
 CURL_SHIFT = 0.02  # of the box's side: how far it pushes, at most, at the base; the top stands still
@@ -69,8 +70,7 @@ def pushed(curl, x, y, c):
     u, v = x - i, y - j
     i, j = i % n, j % n
     a, b = (i + 1) % n, (j + 1) % n
-    low = curl[i, j, c] * (1.0 - v) + curl[i, b, c] * v
-    return low * (1.0 - u) + (curl[a, j, c] * (1.0 - v) + curl[a, b, c] * v) * u
+    return bilinear(curl[i, j, c], curl[i, b, c], curl[a, j, c], curl[a, b, c], u, v)
 
 
 @jit

@@ -35,7 +35,7 @@ from data_synth.errors import InputError
 from data_synth.fresnel import reflectance
 from data_synth.jit import jit
 from data_synth.rng import uniform
-from data_synth.vec import add, cross, dot, frame, neg, scale, sphere_direction, sub, unit
+from data_synth.vec import add, bilinear, cross, dot, frame, neg, scale, sphere_direction, sub, unit
 
 SPECULAR, DIFFUSE, GLOSSY, REFRACTIVE = range(4)
 MICRO = {"specular": SPECULAR, "diffuse": DIFFUSE, "glossy": GLOSSY, "refractive": REFRACTIVE}
@@ -180,7 +180,7 @@ def together(tables: list[Table]) -> Table:
 
 
 @jit
-def bilinear(table, block, w):
+def table_at(table, block, w):
     """Block k of the table, D of row k, or kinds + k, its sigma, at a direction: both are even."""
     rows, columns, values = table.rows, table.columns, table.values
     s = 1.0 if w[2] >= 0.0 else -1.0
@@ -193,18 +193,17 @@ def bilinear(table, block, w):
     at = (block * (rows + 1) + i) * columns
     a = at + (j + 1) % columns
     at += j
-    near = values[at] * (1.0 - v) + values[at + columns] * v
-    return near * (1.0 - u) + (values[a] * (1.0 - v) + values[a + columns] * v) * u
+    return bilinear(values[at], values[at + columns], values[a], values[a + columns], u, v)
 
 
 @jit
 def projected_area(n, w):
-    return sggx.projected_area(n.S, w) if n.row < 0 else bilinear(n.table, n.table.kinds + n.row, w)
+    return sggx.projected_area(n.S, w) if n.row < 0 else table_at(n.table, n.table.kinds + n.row, w)
 
 
 @jit
 def normal_density(n, m):
-    return sggx.normal_density(n.S, m) if n.row < 0 else bilinear(n.table, n.row, m)
+    return sggx.normal_density(n.S, m) if n.row < 0 else table_at(n.table, n.row, m)
 
 
 @jit
@@ -231,7 +230,7 @@ def sample_table(table, k, w, rng):
         phi, r = 2.0 * math.pi * (j + uniform(rng)) / columns, math.sqrt(max(1.0 - z * z, 0.0))
         m = (r * math.cos(phi), r * math.sin(phi), z)
         seen = dot(m, w)
-        if uniform(rng) * bound < bilinear(table, k, m) * abs(seen):
+        if uniform(rng) * bound < table_at(table, k, m) * abs(seen):
             return m if seen > 0.0 else neg(m)
 
 

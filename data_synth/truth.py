@@ -150,6 +150,8 @@ def described(scene: Scene) -> dict[str, dict[str, object]]:
         told: dict[str, object] = {"kind": "rgb_grid" if isinstance(m, Channels) else KINDS[one.kind]}
         if one.kind == media.GRID:
             told["density"] = [*grid, 3] if isinstance(m, Channels) else grid
+        if m is one and one.attributes.size > 1:
+            told["attribute"] = "grid"
         varied = {"albedo": c.albedo >= 0 or isinstance(m, Channels), "Le": c.Le >= 0, "g": c.g >= 0, "S": c.S >= 0}
         told |= {name: "grid" for name, is_grid in varied.items() if is_grid}
         if one.detail.octaves:

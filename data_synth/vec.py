@@ -100,6 +100,12 @@ def slab(ray, lo, hi, t0, t1):
 
 
 @jit
+def bilinear(a, b, c, d, u, v):
+    """Four corners, the second axis faster, at fractions u, v of the first and second axis."""
+    return (a * (1.0 - v) + b * v) * (1.0 - u) + (c * (1.0 - v) + d * v) * u
+
+
+@jit
 def trilinear(c, u, v, w):
     """Eight corners c, the last axis fastest, at fractions u, v, w of the first, second and last axis."""
     low = (c[0] * (1.0 - w) + c[1] * w) * (1.0 - v) + (c[2] * (1.0 - w) + c[3] * w) * v

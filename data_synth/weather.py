@@ -19,7 +19,9 @@ from data_synth.detail import NONE, Detail, eroded
 from data_synth.errors import InputError
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.noise import CloudTextures, cloud_textures, remap
+from data_synth.vec import bilinear
 
+RIM = 0.9  # width of a rim, soft so that detail can erode it
 LARGEST = 4096  # pixels along a side of a map
 
 
@@ -58,9 +60,8 @@ def weather_at(weather, x, y, c):
     """Channel c of a map at a point of the unit square, bilinear."""
     u, v = x * (weather.shape[0] - 1), y * (weather.shape[1] - 1)
     i, j = min(int(u), weather.shape[0] - 2), min(int(v), weather.shape[1] - 2)
-    u, v = u - i, v - j
-    near = weather[i, j, c] * (1.0 - v) + weather[i, j + 1, c] * v
-    return near * (1.0 - u) + (weather[i + 1, j, c] * (1.0 - v) + weather[i + 1, j + 1, c] * v) * u
+    corners = (weather[i, j, c], weather[i, j + 1, c], weather[i + 1, j, c], weather[i + 1, j + 1, c])
+    return bilinear(*corners, u - i, v - j)
 
 
 @jit
@@ -80,7 +81,7 @@ def _fill(t, detail, weather, tiles, cloud, rain, first, last):
             cover, kind, wet = weather_at(weather, x, y, 0), weather_at(weather, x, y, 1), weather_at(weather, x, y, 2)
             for k in range(nz):
                 z = k / (nz - 1)
-                shape = shape_at(t, mixed_gradient(kind, z), cover, tiles[0] * x, tiles[1] * y, tiles[2] * z)
+                shape = shape_at(t, mixed_gradient(kind, z), cover, RIM, tiles[0] * x, tiles[1] * y, tiles[2] * z)
                 cloud[i, j, k] = eroded(detail, shape, x, y, z)
                 rain[i, j, k] = wet * remap(z, 0.15, 0.75, 1.0, 0.0)
 

@@ -110,4 +110,6 @@ def test_grids_are_written_and_said(tmp_path):
         "medium2": {"kind": "grid", "density": [*n], "Le": "grid", "S": "grid"},
         "medium3": {"kind": "function", "density": "the function fog"},
     }
+    hot = Scene(medium=media.grid(density, (0,) * 3, (1, 2, 3), attribute=density / density.max()))
+    assert truth.described(hot)["medium0"] == {"kind": "grid", "density": [*n], "attribute": "grid"}
     assert _provenance(scene, Options())["truth"] == truth.described(scene)
