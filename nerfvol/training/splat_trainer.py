@@ -104,8 +104,8 @@ class SplatTrainer:
         return SECONDS_TO_WRITE
 
     def needs_images(self) -> bool:
-        """The photographs hold them."""
-        return False
+        """The photographs hold them: released, they would be read a second time for the table of photographs."""
+        return True
 
     def outgrown(self) -> str | None:
         """The number of splats is bounded before the start."""

@@ -144,6 +144,7 @@ def _train(
         appearance = phase.appearance
         if data.training.scene.is_unbounded:
             run.say(write_table(run.folder / run_folder.PHOTOGRAPHS, data.training, phase))
+        data.training.release()
         if appearance.active:
             run.say(appearance.sentence())
         if (refined := phase.refined()) is not None:
