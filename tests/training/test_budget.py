@@ -6,6 +6,7 @@ import re
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from nerfvol.cli.command import set_threads
@@ -175,3 +176,26 @@ def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, second
     assert len(views) == (scored or len(held_out)) and len(held_out) > 2
     assert views.names[0] == held_out.names[0] and views.names[-1] == held_out.names[-1]
     assert bool(scored) == any(f"2 of the {len(held_out)} held-out views are scored" in line for line in said)
+
+
+def test_previews_take_a_hundredth_of_a_budget_at_most(tmp_path, tiny_scene, monkeypatch):
+    """By a clock that goes on 0.3 s a preview: one before it is known what they take, none that would exceed the share."""
+
+    class Drawn(Pretended):
+        preview_width = 400
+
+        def picture(self, camera):
+            now[0] += 0.3
+            return np.zeros((camera.intrinsics.height, camera.intrinsics.width, 3), np.float32)
+
+    now = [0.0]
+    written = []
+    monkeypatch.setattr(session.pictures, "write_png", lambda path, image: written.append(path.name))
+    for budget, moments in ((7.0, 0), (20.0, 1), (100.0, 3), (None, 5)):
+        run = run_of(settings(tiny_scene, tmp_path, time_budget=budget))
+        written.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(session.time, "perf_counter", lambda: now[0])
+            for moment in (0.03, 0.1, 0.3, 0.6, 1.0):
+                run.preview(Drawn("octree"), moment)
+        assert len(written) == moments
