@@ -159,4 +159,3 @@ def _doubts(cameras: Sequence[Camera], focus: Focus) -> list[str]:
             "z forward)? then negate the second and third column of each"
         ]
     return []
-

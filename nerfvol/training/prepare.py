@@ -151,7 +151,13 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
     )
     started = time.perf_counter()
     held_out = load_dataset(
-        config.data, "val", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene, most=LARGEST_HELD_OUT
+        config.data,
+        "val",
+        config.downscale,
+        config.aabb,
+        holdout=config.holdout,
+        scene=config.scene,
+        most=LARGEST_HELD_OUT,
     )
     first = held_out.evenly(1)
     compared = held_out.evenly(config.compare_views).middles(COMPARED_SIZE)

@@ -95,3 +95,35 @@ def test_pictures_that_the_kind_of_scene_is_judged_by_are_decoded_once_for_all_s
     os.utime(picture, ns=(state.st_atime_ns, state.st_mtime_ns + 1000))
     load_dataset(tmp_path, "val")
     assert asked[6:] == ["r_3.png"]
+
+
+def test_only_the_views_that_are_wanted_are_decoded(tmp_path, monkeypatch):
+    """``most``: evenly chosen, the same that Dataset.evenly takes of all."""
+    write_scene(tmp_path, {"train": 5, "val": 7}, size=20)
+    everything = load_dataset(tmp_path, "val").evenly(3)
+    read, asked = load.read_pixels, []
+    monkeypatch.setattr(load, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
+    some = load_dataset(tmp_path, "val", most=3)
+    assert some.names == everything.names == ["r_0", "r_3", "r_6"] and sorted(asked) == [
+        "r_0.png",
+        "r_3.png",
+        "r_6.png",
+    ]
+    for a, b in zip(some.images, everything.images, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_what_was_decoded_to_judge_the_scene_is_not_decoded_again(tmp_path, monkeypatch, downscale):
+    """Pictures larger than those that are looked at: taken over whole, once, and then read again like all others."""
+    write_scene(tmp_path, {"train": 3, "val": 1}, size=300)
+    read, asked = load.read_pixels, []
+    monkeypatch.setattr(load, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
+    load._sampled.cache_clear()
+    dataset = load_dataset(tmp_path, "train", downscale)
+    first = [image.copy() for image in dataset.images]
+    assert asked == []
+    dataset.release()
+    for a, b in zip(first, dataset.images, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert sorted(asked) == ["r_0.png", "r_1.png", "r_2.png"]

@@ -204,3 +204,26 @@ def test_a_representation_that_grew_is_asked_anew(tmp_path, tiny_scene, monkeypa
     for now[0], size[0] in [(5, 0), (6, 1), (9, 1), (10, 1), (12, 2), (17, 2), (30, 2)]:
         run.keep_time(phase)
     assert asked == [9, 17]
+
+
+def test_previews_take_a_hundredth_of_a_budget_at_most(tmp_path, tiny_scene, monkeypatch):
+    """By a clock that goes on 0.3 s a preview: one before it is known what they take, none that would exceed the share."""
+
+    class Drawn(Pretended):
+        preview_width = 400
+
+        def picture(self, camera):
+            now[0] += 0.3
+            return np.zeros((camera.intrinsics.height, camera.intrinsics.width, 3), np.float32)
+
+    now = [0.0]
+    written = []
+    monkeypatch.setattr(session.pictures, "write_png", lambda path, image: written.append(path.name))
+    for budget, moments in ((7.0, 0), (20.0, 1), (100.0, 3), (None, 5)):
+        run = run_of(settings(tiny_scene, tmp_path, time_budget=budget))
+        written.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(session.time, "perf_counter", lambda: now[0])
+            for moment in (0.03, 0.1, 0.3, 0.6, 1.0):
+                run.preview(Drawn("octree"), moment)
+        assert len(written) == moments
