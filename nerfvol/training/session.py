@@ -144,6 +144,7 @@ class Run:
         self._claimed = False
         self._log: BinaryIO | None = None
         self._entered = False  # a phase, without a step since
+        self._scoring: float | None = None  # seconds that a view's scores take, once they were measured
         self._reserve = self._time_to_finish()
         self._looked, self._size_then = self.clock.elapsed(), ""
         self._last_save = time.perf_counter()
@@ -373,14 +374,13 @@ class Run:
         """
         if self.config.time_budget is None:
             return 0.0
-        started = time.perf_counter()
-        image = self.data.first.composited(0, self.background)
-        ssim(image, image)
-        scoring = (time.perf_counter() - started) / ops.get_threads()  # so many views are scored side by side
+        if self._scoring is None:
+            image = self.data.first.composited(0, self.background)
+            self._scoring = _seconds(ssim, image, image) / ops.get_threads()  # so many views are scored side by side
         rows = len(self.data.training) if self.data.training.scene.is_unbounded else 0
         small = 0.0
         if phase is None:
-            rendering = 0.1e-6 * image.size / 3
+            rendering = 0.1e-6 * self.data.first.images[0].size / 3
             writing = EXPECTED_SECONDS_TO_WRITE if self.config.representation == "octree" else SECONDS_TO_WRITE
         else:
             rendering = _seconds(phase.picture, self.data.held_out.cameras[0])
@@ -393,14 +393,14 @@ class Run:
             writing
             + self.data.reading
             + (TABLE_SECONDS + small) * rows
-            + 1.1 * len(self.data.held_out) * (scoring + rendering + FIT_SECONDS * self.config.refine_poses),
+            + 1.1 * len(self.data.held_out) * (self._scoring + rendering + FIT_SECONDS * self.config.refine_poses),
             RESERVE_SHARE * self.config.time_budget,
         )
 
 
-def _seconds(draw: Callable[[Camera], object], camera: Camera) -> float:
+def _seconds(function: Callable[..., object], *arguments: object) -> float:
     started = time.perf_counter()
-    draw(camera)
+    function(*arguments)
     return time.perf_counter() - started
 
 
