@@ -28,7 +28,7 @@ from data_synth.fields import NOTHING, Columns, Given, cell_at, colour, is_grid,
 from data_synth.functions import address_of, bounded
 from data_synth.jit import jit
 from data_synth.sggx import projected_area
-from data_synth.vec import slab, trilinear
+from data_synth.vec import slab
 
 Point = Sequence[float] | np.ndarray
 HOMOGENEOUS, GRID, EXPONENTIAL, FUNCTION = range(4)
@@ -247,23 +247,8 @@ def dense_of(m: Medium, samples: np.ndarray, first: int = 0, columns: int = 1) -
 
 @jit
 def interpolated(m, values, p):
-    """Interpolate brick samples ``values`` at p, 0 outside the stored bricks. It is ``fields.mixed`` of one column,
-    written out because tracking does little else."""
-    n = m.cells
-    u = (p[0] - m.lo[0]) / m.cell[0]
-    v = (p[1] - m.lo[1]) / m.cell[1]
-    w = (p[2] - m.lo[2]) / m.cell[2]
-    i = min(max(int(u), 0), n[0] - 1)
-    j = min(max(int(v), 0), n[1] - 1)
-    k = min(max(int(w), 0), n[2] - 1)
-    first = m.offsets[((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3)]
-    if first < 0:
-        return 0.0
-    a = first + ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
-    b = a + 81
-    corners = (values[a], values[a + 1], values[a + 9], values[a + 10])
-    others = (values[b], values[b + 1], values[b + 9], values[b + 10])
-    return trilinear(corners + others, u - i, v - j, w - k)
+    """Interpolate brick samples ``values`` at p, 0 outside the stored bricks."""
+    return mixed(values, 1, 0, cell_at(m, p))
 
 
 @jit
