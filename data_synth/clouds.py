@@ -21,7 +21,7 @@ from data_synth.jit import in_bands, jit, kernel
 from data_synth.noise import CloudTextures, cloud_textures, remap, texture_at
 
 STRATUS, CUMULUS, CUMULONIMBUS = range(3)
-RIM = 0.3  # width of a single cloud's rim
+RIM = 0.3  # width of a cloud's rim
 DETAIL_TILES = 5.0  # of the detail noise for one of the base noise
 TYPES = {"stratus": STRATUS, "cumulus": CUMULUS, "cumulonimbus": CUMULONIMBUS}
 

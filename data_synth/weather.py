@@ -14,14 +14,13 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image
 
-from data_synth.clouds import CUMULONIMBUS, CUMULUS, STRATUS, height_gradient, shape_at
+from data_synth.clouds import CUMULONIMBUS, CUMULUS, RIM, STRATUS, height_gradient, shape_at
 from data_synth.detail import NONE, Detail, eroded
 from data_synth.errors import InputError
 from data_synth.jit import in_bands, jit, kernel
 from data_synth.noise import CloudTextures, cloud_textures, remap
 from data_synth.vec import bilinear
 
-RIM = 0.9  # width of a rim, soft so that detail can erode it
 LARGEST = 4096  # pixels along a side of a map
 
 

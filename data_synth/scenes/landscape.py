@@ -16,7 +16,7 @@ DRY, WET = 0.995, 0.93  # albedo; drops of rain are larger, and absorb more
 
 
 def cloudscape(
-    coverage: float = 0.45, density: float = 70.0, resolution: int = 160, erosion: float = 0.75, detail: int = 3,
+    coverage: float = 0.45, density: float = 50.0, resolution: int = 160, erosion: float = 0.75, detail: int = 3,
     rain: float = 1.0, seed: int = 0, map: str | None = None,
 ) -> Scene:  # fmt: skip
     """heaps of cloud over a landscape, dark where it rains, after a weather map: --set map=weather.png

@@ -261,17 +261,16 @@ def _placed(
 
 
 def _imported(
-    volume: str, lo: media.Point, hi: media.Point,
-    values: tuple[float, float] | Callable[[np.ndarray], tuple[float, float]] | None = None,
-) -> tuple[np.ndarray, media.Point, media.Point]:  # fmt: skip
-    """The volume file's samples scaled to [0, 1], in a box as large as lo..hi allows. values: what becomes 0 and 1, or how to
-    tell from the samples."""
+    volume: str,
+    lo: media.Point,
+    hi: media.Point,
+    values: tuple[float, float] | Callable[[np.ndarray], tuple[float, float]],
+) -> tuple[np.ndarray, media.Point, media.Point]:
+    """A scan's samples scaled to [0, 1], in a box as large as lo..hi allows. values: what becomes 0 and 1, or how to tell from
+    the samples."""
     samples, spacing = read_volume(volume)
-    low, high = (values(samples) if callable(values) else values) or (0.0, float(samples.max()))
+    low, high = values(samples) if callable(values) else values
     if high <= low:
-        raise InputError(f"{volume}: expected a density that is somewhere positive, got at most {high:g}")
-    if values is None and samples.min() < 0:
-        share = float((samples < 0).mean())
-        warnings.warn(f"{volume}: {share:.1%} of the samples are negative and count as 0", RenderWarning, stacklevel=3)
+        raise InputError(f"{volume}: expected samples of more than one value, got {high:g} alone")
     samples = np.clip((samples - low) / (high - low), 0.0, 1.0)
     return np.ascontiguousarray(samples, np.float32), *_placed(samples.shape, spacing, lo, hi)

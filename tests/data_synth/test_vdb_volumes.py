@@ -280,8 +280,11 @@ def test_negative_and_constant_densities(tmp_path):
     np.savez(tmp_path / "one.npz", density=np.ones((3, 3, 3)))
     assert scenes.make("smoke", volume=str(tmp_path / "one.npz")).medium.max_density == 1.0  # a cube of smoke
     np.savez(tmp_path / "two.npz", density=np.linspace(-1, 2, 27).reshape(3, 3, 3))
-    with pytest.warns(RenderWarning, match="33.3% of the samples are negative"):
-        scenes.make("phantom", volume=str(tmp_path / "two.npz"))
+    with pytest.warns(RenderWarning, match="samples are negative, down to -1"):
+        scenes.make("smoke", volume=str(tmp_path / "two.npz"))
+    assert scenes.make("phantom", volume=str(tmp_path / "two.npz")).medium.max_density > 0  # of a scan they are values
+    with pytest.raises(InputError, match=r"one\.npz: expected samples of more than one value, got 1 alone"):
+        scenes.make("phantom", volume=str(tmp_path / "one.npz"))
 
 
 def test_numpy_and_raw(tmp_path):
