@@ -17,7 +17,6 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from nerfvol.cameras.camera import Camera
 from nerfvol.cameras.paths import describe_orbit
 from nerfvol.config.training import Config
 from nerfvol.datasets.images import composite_average
