@@ -109,9 +109,9 @@ def to_plain(settings: Any) -> dict[str, Any]:
     return {field.name: _plain(getattr(settings, field.name)) for field in dataclasses.fields(settings)}
 
 
-def write_yaml(path: str | os.PathLike[str], settings: Any) -> None:
-    """Write the dataclass ``settings`` to ``path`` as YAML, atomically, in the order of its fields."""
-    write_text(path, yaml.safe_dump(to_plain(settings), sort_keys=False, allow_unicode=True))
+def write_yaml(path: str | os.PathLike[str], settings: Mapping[str, Any]) -> None:
+    """Write ``settings``, as :func:`to_plain` makes them, to ``path`` as YAML, atomically and in their order."""
+    write_text(path, yaml.safe_dump(dict(settings), sort_keys=False, allow_unicode=True))
 
 
 def parse_assignment(text: str) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -81,7 +80,8 @@ def claim_folder(config: Config) -> None:
     run = Path(config.out)
     if not config.resume:
         _set_aside(run)
-    write_yaml(run / CONFIG, dataclasses.replace(config, resume=False))  # the file as --config starts a run of its own
+    # As --config the file starts a run of its own. A resumed one needs the file of its start no more, which may be gone.
+    write_yaml(run / CONFIG, to_plain(config) | {"resume": False})
 
 
 def _refuse_changes(old: dict[str, Any], new: dict[str, Any]) -> None:

@@ -177,7 +177,7 @@ def test_colour():
 def test_written_file_reads_back_the_same(tmp_path):
     section = {"aabb": [1, 2, 3]}
     settings = build({"background": "black", "section": section, "data": "é x"})
-    write_yaml(tmp_path / "config.yaml", settings)
+    write_yaml(tmp_path / "config.yaml", to_plain(settings))
     assert assemble(Settings, (read_yaml(tmp_path / "config.yaml"), "file")) == settings
 
 
