@@ -7,7 +7,6 @@ colour premultiplied by alpha, summed exactly in integers and rounded once.
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,6 +22,7 @@ from PIL import Image, UnidentifiedImageError
 from nerfvol.cameras.warp import reduce
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
+from nerfvol.files.unchanged import while_unchanged
 from nerfvol.machine import usable_cores
 
 UInt8 = NDArray[np.uint8]
@@ -118,18 +118,9 @@ class ImageHeader:
         return (height, width) if self.orientation >= 5 else (width, height)
 
 
+@while_unchanged(4096)
 def image_header(path: Path) -> ImageHeader:
-    """What the file's header says, without decoding; InputError where it is no image, damaged or too large. Every split of a
-    folder asks: a file is opened once while it stays as it is."""
-    try:
-        state = path.stat()
-    except OSError:
-        return _header.__wrapped__(path, 0, 0)  # its sentence says what is wrong
-    return _header(path, state.st_mtime_ns, state.st_size)
-
-
-@functools.lru_cache(maxsize=4096)
-def _header(path: Path, changed: int, size: int) -> ImageHeader:
+    """What the file's header says, without decoding; InputError where it is no image, damaged or too large."""
     with _opened(path) as image:
         orientation = _exif(image, path).get(_EXIF_ORIENTATION, 1)
         known = type(orientation) is int and 1 <= orientation <= 8

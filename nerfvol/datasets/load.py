@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,6 +39,7 @@ from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
 from nerfvol.datasets.listing import Frame, Listing, listed_names, named
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError, shown
+from nerfvol.files.unchanged import while_unchanged
 from nerfvol.machine import total_memory
 from nerfvol.region import SceneBounds, check_box
 
@@ -181,9 +181,9 @@ class _Sampled:
         return whole
 
 
-@functools.lru_cache(maxsize=MOST_JUDGED)
-def _sampled(path: Path, changed: int, size: int) -> _Sampled:
-    """Every split of a scene is judged by the same pictures: they are decoded once while their files stay as they are."""
+@while_unchanged(MOST_JUDGED)
+def _sampled(path: Path) -> _Sampled:
+    """Every split of a scene is judged by the same pictures."""
     small, whole = read_small(path, JUDGED_SIZE)
     # Where the picture itself is small enough it is what is looked at: it would stay for as long as that does.
     kept = whole is not None and whole is not small and whole.nbytes <= MOST_KEPT // MOST_JUDGED
@@ -197,8 +197,7 @@ def _sample(views: Sequence[View], threads: int | None) -> tuple[list[tuple[View
 
     def small(view: View) -> _Sampled | InputError:
         try:
-            state = view.path.stat()
-            return _sampled(view.path, state.st_mtime_ns, state.st_size)
+            return _sampled(view.path)
         except InputError as error:
             return error
 

@@ -6,7 +6,6 @@ camera-to-world ``transform_matrix`` in OpenGL axes. Formats and sources: docs/d
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from nerfvol.datasets.formats import SPLITS
 from nerfvol.datasets.listing import Frame, ImageFinder, Listing, MaskFinder, Poses, hold_out, named
 from nerfvol.errors import InputError, shown
 from nerfvol.files.atomic import read_json
+from nerfvol.files.unchanged import while_unchanged
 from nerfvol.region import check_box
 
 
@@ -180,17 +180,9 @@ class _Stated:
     poses: Poses
 
 
+@while_unchanged(3)
 def _stated(path: Path) -> _Stated:
-    """The file's content; every split of a folder reads it, and it is understood once while the file stays as it is."""
-    try:
-        state = path.stat()
-    except OSError:
-        return _understood.__wrapped__(path, 0, 0)  # its sentence says what is wrong
-    return _understood(path, state.st_mtime_ns, state.st_size)
-
-
-@functools.lru_cache(maxsize=3)
-def _understood(path: Path, changed: int, size: int) -> _Stated:
+    """The file's content."""
     data, poses, entries = _load_json(path), Poses(path), []
     shared = {key: value for key, value in data.items() if key != "frames"}
     common: Calibration | None = None
