@@ -8,6 +8,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -135,16 +136,24 @@ def process_seconds() -> float:
 
 
 def describe_hardware() -> dict[str, Any]:
-    """cpu, usable cores, memory in GiB, platform and the kernels' build in use, JSON-able."""
+    """cpu, the clock it runs at now in GHz (None without compiled kernels), usable cores, memory in GiB, platform and the
+    kernels' build in use, JSON-able."""
     total, compiled = total_memory(), native()
     return {
         "cpu": cpu_model(),
+        "clock_ghz": None if compiled is None else round(compiled.clock_ghz(), 2),
         "cores": usable_cores(),
         "memory_gib": None if total is None else round(total / 2**30, 1),
         "platform": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "kernel_path": "reference" if compiled is None else compiled.isa(),
     }
+
+
+def processor(hardware: Mapping[str, Any]) -> str:
+    """The processor of a ``describe_hardware`` for a heading: its name and clock (records before 2026-11-30 have none)."""
+    clock = hardware.get("clock_ghz")
+    return hardware["cpu"] + (f" at {clock:.1f} GHz" if clock else "")
 
 
 def usable_cores() -> int:

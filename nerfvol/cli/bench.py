@@ -139,8 +139,10 @@ def print_splat_tables(record: dict[str, Any]) -> None:
 
 
 def _print_head(record: dict[str, Any], what: str) -> None:
+    from nerfvol.machine import processor
+
     hardware, file = record["hardware"], record["file"]
-    print(f"{hardware['cpu']}, {record['threads']} threads, kernels {hardware['kernel_path']}")
+    print(f"{processor(hardware)}, {record['threads']} threads, kernels {hardware['kernel_path']}")
     print(f"{what}, {file['bytes'] / 1e6:.1f} MB, loads in {file['seconds']:.2f} s\n")
 
 

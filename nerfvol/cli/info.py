@@ -55,6 +55,8 @@ def run(options: InfoOptions) -> int:
 
 
 def _print(record: dict[str, Any]) -> None:
+    from nerfvol.machine import processor
+
     hardware = record["hardware"]
     if "file" in record:
         _print_file(record["file"])
@@ -71,7 +73,7 @@ def _print(record: dict[str, Any]) -> None:
         for key, value in record.get(kind, {}).items():
             print(f"{key.replace('_', ' '):15s} {f'{value:,}' if type(value) is int else json.dumps(value)}")
     print(f"nerfvol         {record['nerfvol']}")
-    print(f"machine         {hardware['cpu']}, {hardware['cores']} cores, {hardware['memory_gib']} GiB")
+    print(f"machine         {processor(hardware)}, {hardware['cores']} cores, {hardware['memory_gib']} GiB")
     others = [path for path in record["kernel_paths"] if path != hardware["kernel_path"]]
     print(f"compute path    {hardware['kernel_path']}" + (f" (also: {', '.join(others)})" if others else ""))
 

@@ -13,6 +13,7 @@ from nerfvol.config.assemble import run_settings
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write, read_json, write_json, write_text
 from nerfvol.files.run_folder import METRICS
+from nerfvol.machine import processor
 
 PUBLISHED: dict[str, dict[str, list[tuple[float | None, float]]]] = {
     "none": {},
@@ -72,8 +73,8 @@ def table(record: Mapping[str, Any]) -> str:
     hardware, rows = record["hardware"], record["rows"]
     size = "×".join(map(str, rows[0]["image_size"]))
     lines = [
-        f"{record['data']}: {rows[0]['n_images']} held-out views at {size}; {hardware['cpu']}, {record['threads']} threads, "
-        f"{hardware['kernel_path']}, nerfvol {record['nerfvol']}",
+        f"{record['data']}: {rows[0]['n_images']} held-out views at {size}; {processor(hardware)}, "
+        f"{record['threads']} threads, {hardware['kernel_path']}, nerfvol {record['nerfvol']}",
         "",
         "| representation | budget | seconds | PSNR / dB | SSIM | MB | s / frame |",
         "|---|---|---|---|---|---|---|",

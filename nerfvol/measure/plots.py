@@ -12,6 +12,7 @@ import numpy as np
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.atomic import atomic_write, ensure_writable_folder, read_json
+from nerfvol.machine import processor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,7 +79,7 @@ def bench_figure(record: dict[str, Any], run_folders: Sequence[str]) -> Figure:
         _draw_runs(axes[2], run_folders)
     hardware, machine = record["hardware"], record["machine"]
     figure.suptitle(
-        f"{hardware['cpu']}, {record['threads']} threads, {hardware['kernel_path']}: an octree of "
+        f"{processor(hardware)}, {record['threads']} threads, {hardware['kernel_path']}: an octree of "
         f"{record['octree']['leaves']:,} leaves and coarser versions of it; roofline: {machine['bandwidth'] / 1e9:.0f} GB/s, "
         f"{machine['operations'] / 1e9:.0f} GFLOP/s",
         fontsize=10,
@@ -104,7 +105,7 @@ def _splat_figure(record: dict[str, Any], run_folders: Sequence[str]) -> Figure:
     if run_folders:
         _draw_runs(axes[2], run_folders)
     hardware, count = record["hardware"], record[record["representation"]]["count"]
-    title = f"{hardware['cpu']}, {record['threads']} threads: {count:,} {record['representation']}"
+    title = f"{processor(hardware)}, {record['threads']} threads: {count:,} {record['representation']}"
     figure.suptitle(title, fontsize=10)
     return figure
 

@@ -332,6 +332,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     bind_fields(m);
     m.def("set_threads", &set_threads, "n"_a);
     m.def("get_threads", &get_threads);
+    m.def("clock_ghz", &clock_ghz);
     m.def("isa", [] { return std::string(isa_name()); });
     m.def("set_isa", [](const std::string& name) { return set_isa(name.c_str()); }, "name"_a);
     m.def("available_isas", [] {

@@ -109,6 +109,7 @@ const Kernels& kernels();                        // the chosen instruction set
 const SplatKernels& splat_kernels();
 const FieldKernels& field_kernels();
 const char* isa_name();
+double clock_ghz();
 bool set_isa(const char* name);                  // "auto" or a name from available_isas(); false if this CPU lacks it
 int available_isas(const char** names);          // fills up to 3 names, best first
 
