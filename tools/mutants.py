@@ -53,7 +53,7 @@ MUTANTS = (
     # ---------------------------------------------------------------- datasets
     M("nerfvol/datasets/listing.py", "if scale != 1:", "if False:", PEOPLE, "scaled axes are taken in silence"),
     M("nerfvol/datasets/listing.py", "self.lost.append(listed)\n", "", PEOPLE, "lost poses are passed over in silence"),
-    M("nerfvol/datasets/listing.py", 'and not path.name.startswith(".") and not is_mask', "and not is_mask", PEOPLE, "files of operating systems are photographs"),
+    M("nerfvol/datasets/listing.py", 'path.name.startswith(".") or is_mask', "is_mask", PEOPLE, "files of operating systems are photographs"),
     M("nerfvol/datasets/listing.py", "MaskFile(mask, black_is_out=False)", "MaskFile(mask)", MASKS, "the convention of dynamic masks"),
     M("nerfvol/datasets/frames.py", "parts.append(pixels if mask.black_is_out else 255 - pixels)", "parts.append(255 - pixels if mask.black_is_out else pixels)", MASKS, "masks the other way round"),
     M("nerfvol/datasets/frames.py", "found |= {id(view) for", "found |= {None for", PEOPLE, "cameras astray stay in"),
