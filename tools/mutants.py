@@ -117,7 +117,7 @@ MUTANTS = (
     # ---------------------------------------------------------------- mathematics
     M("nerfvol/measure/metrics.py", "mse = float(np.mean(error * error, dtype=np.float64))", "mse = float(np.mean(np.abs(error), dtype=np.float64))", "measure/test_metrics.py", "PSNR of the absolute error"),
     M("nerfvol/measure/scores.py", "psnr(of[seen], truth[seen])", "psnr(of, truth)", MASKS, "masked pixels are scored"),
-    M("nerfvol/region.py", "np.ceil(np.log2(np.maximum(distance, 1)))", "np.floor(np.log2(np.maximum(distance, 1)))", "octree test_views.py starts", "levels of the background shells"),
+    M("nerfvol/region.py", "np.ceil(np.log2(np.maximum(distance, 1)))", "np.floor(np.log2(np.maximum(distance, 1)))", "test_region.py", "levels of the background shells"),
     M("nerfvol/views.py", "pose[:3, 3] = (pose[:3, 3] - middle) / scale", "pose[:3, 3] = pose[:3, 3] / scale", FAULTS, "cameras far from the origin"),
     # ---------------------------------------------------------------- cameras and numbers, second values
     M("nerfvol/cameras/interpolate.py", "before * w_after[:, None] + after * w_before[:, None]", "before * w_before[:, None] + after * w_after[:, None]", "cameras/test_paths.py", "tangents between uneven keyframes"),
