@@ -113,7 +113,7 @@ def _measure_octree(target: Target, options: BenchOptions, threads: int) -> dict
         "render": bench.measure_rendering(
             octree, [views[size] for size in options.sizes], threads, options.repeats or REPEATS
         ),
-        "size": bench.measure_sizes(octree, views[bench.BASE_SIZE], options.repeats, machine),
+        "size": bench.measure_sizes(octree, views[bench.BASE_SIZE], options.repeats or REPEATS, machine),
     }
     record["exponents"] = bench.exponents(record["size"])
     if options.reference:
