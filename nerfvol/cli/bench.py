@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from nerfvol import __version__
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.values import Count
 from nerfvol.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfvol.config.training import Config
+
+REPEATS = 5
+"""Of a measurement, where nothing else is said."""
 
 
 @dataclass
@@ -19,7 +26,7 @@ class BenchOptions:
 
     target: str = ""
     sizes: tuple[Count, ...] = (400, 800, 1600)
-    repeats: Count = 5
+    repeats: Count | None = None
     reference: bool = True
     json: str | None = None
     plot: str | None = None
@@ -37,7 +44,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     """Adds the command's options to the parser ``p``."""
     add_target(p)
     p.add_argument("--sizes", metavar="LIST", help="square picture sizes (default: 400,800,1600)")
-    p.add_argument("--repeats", metavar="N", help="the median of N measurements is reported (default: 5)")
+    p.add_argument("--repeats", metavar="N", help="the median of N measurements is reported (default: 5; with --ladder "
+                   "of N runs with the seeds 0, 1, …, default: 1)")  # fmt: skip
     p.add_argument("--no-reference", dest="reference", action="store_false",
                    help="leave out the comparison with plain torch and the paper-size MLP")  # fmt: skip
     p.add_argument("--json", metavar="FILE", help="write every figure as JSON")
@@ -101,9 +109,11 @@ def _measure_octree(target: Target, options: BenchOptions, threads: int) -> dict
         "machine": {**vars(machine), "bandwidth": machine.bandwidth},
         "view_size": bench.BASE_SIZE,
         "octree": {"path": str(target.path), "leaves": octree.n_leaves, "vertices": octree.n_vertices},
-        "file": bench.measure_loading(target.path, options.repeats),
-        "render": bench.measure_rendering(octree, [views[size] for size in options.sizes], threads, options.repeats),
-        "size": bench.measure_sizes(octree, views[bench.BASE_SIZE], options.repeats, machine),
+        "file": bench.measure_loading(target.path, options.repeats or REPEATS),
+        "render": bench.measure_rendering(
+            octree, [views[size] for size in options.sizes], threads, options.repeats or REPEATS
+        ),
+        "size": bench.measure_sizes(octree, views[bench.BASE_SIZE], options.repeats or REPEATS, machine),
     }
     record["exponents"] = bench.exponents(record["size"])
     if options.reference:
@@ -124,8 +134,8 @@ def _measure_splats(target: Target, options: BenchOptions, threads: int) -> dict
     described = model.describe()
     return {
         model.kind: {"path": str(target.path), "count": described[model.kind], **described},
-        "file": splat_bench.measure_loading(target.path, options.repeats),
-        "render": splat_bench.measure(model, views, threads, options.repeats),
+        "file": splat_bench.measure_loading(target.path, options.repeats or REPEATS),
+        "render": splat_bench.measure(model, views, threads, options.repeats or REPEATS),
     }
 
 
@@ -212,10 +222,8 @@ def run_ladder(options: BenchOptions) -> int:
         raise InputError("nerfvol bench takes either RUN|FILE or --ladder DATA, not both")
     need("bench --ladder", ladder=options.ladder, out=options.out)
     import time
-    from pathlib import Path
 
-    from nerfvol.config.assemble import assemble, read_yaml, to_plain
-    from nerfvol.config.training import Config
+    from nerfvol.config.assemble import to_plain
     from nerfvol.files.atomic import read_json
     from nerfvol.machine import describe_hardware
     from nerfvol.measure import ladder
@@ -225,34 +233,51 @@ def run_ladder(options: BenchOptions) -> int:
     if not options.representations:
         raise InputError("--representations: expected octree, splats or both")
     budgets = ladder.budgets(options.budgets)
-    shared = (read_yaml(options.settings), options.settings) if options.settings else ({}, "settings")
     prepare_outputs(folder=options.out)
     threads = set_threads(options.threads)
-    configs = {}  # all settings are checked before the first run begins
-    for name in options.representations:
-        for budget, settings in budgets.items():
-            folder = Path(options.out) / f"{name}_{budget}"
-            own = {"data": options.ladder, "out": str(folder), "representation": name, "threads": options.threads}
-            configs[name, budget] = folder, assemble(Config, shared, (settings, "--budgets"), (own, "bench"))
+    rungs = _rungs(options, budgets)  # all settings are checked before the first run begins
     rows: list[dict[str, Any]] = []
     record: dict[str, Any] = {}
     written: list[Path] = []
-    for (name, budget), (folder, config) in configs.items():
-        metrics = ladder.finished(folder, to_plain(config))
-        print(f"{name}, {budget}: {'finished before' if metrics else 'training'}", flush=True)
-        if metrics is None:
-            from nerfvol.training.train import train
+    for (name, budget), runs in rungs.items():
+        scored = []
+        for folder, config in runs:
+            metrics = ladder.finished(folder, to_plain(config))
+            print(f"{folder.name}: {'finished before' if metrics else 'training'}", flush=True)
+            if metrics is None:
+                from nerfvol.training.train import train
 
-            train(config, started=time.perf_counter())
-            metrics = read_json(folder / "metrics.json")
-        rows.append(ladder.row_of(name, budget, folder, metrics))
+                train(config, started=time.perf_counter())
+                metrics = read_json(folder / "metrics.json")
+            scored.append((folder, metrics))
+        rows.append(ladder.row_of(name, budget, scored))
         record = {
             "nerfvol": __version__, "hardware": describe_hardware(), "threads": threads, "data": options.ladder,
             "rows": rows, "published": ladder.PUBLISHED[options.published],
         }  # fmt: skip
-        written = ladder.write_ladder(Path(options.out), record)  # after each run: the next may take long
+        written = ladder.write_ladder(Path(options.out), record)  # after each rung: the next may take long
     print(f"\n{ladder.table(record)}\nwritten: {', '.join(map(str, written))}")
     return 0
+
+
+def _rungs(
+    options: BenchOptions, budgets: dict[str, dict[str, Any]]
+) -> dict[tuple[str, str], list[tuple[Path, Config]]]:
+    """Folder and settings of each run, by representation and budget."""
+    from nerfvol.config.assemble import assemble, read_yaml
+    from nerfvol.config.training import Config
+    from nerfvol.measure.ladder import folder_of
+
+    shared = (read_yaml(options.settings), options.settings) if options.settings else ({}, "settings")
+    rungs: dict[tuple[str, str], list[tuple[Path, Config]]] = {}
+    for name in options.representations:
+        for budget, settings in budgets.items():
+            for k in range(options.repeats or 1):
+                folder = folder_of(Path(options.out), name, budget, k)
+                own = {"data": options.ladder, "out": str(folder), "representation": name, "threads": options.threads}
+                config = assemble(Config, shared, (settings, "--budgets"), (own, "bench"))
+                rungs.setdefault((name, budget), []).append((folder, replace(config, seed=config.seed + k)))
+    return rungs
 
 
 COMMAND = Command(

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nerfvol.config.assemble import run_settings
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write, read_json, write_json, write_text
@@ -47,10 +49,17 @@ def finished(folder: Path, wanted: Mapping[str, Any]) -> dict[str, Any] | None:
     return metrics if isinstance(metrics, dict) and all(key in metrics for key in KEPT) else None
 
 
-def row_of(representation: str, budget: str, folder: Path, metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """One rung."""
+def folder_of(out: Path, representation: str, budget: str, repeat: int) -> Path:
+    """Of the run number ``repeat``, from 0, of one rung."""
+    return out / (f"{representation}_{budget}" + (f"_{repeat + 1}" if repeat else ""))
+
+
+def row_of(representation: str, budget: str, runs: Sequence[tuple[Path, Mapping[str, Any]]]) -> dict[str, Any]:
+    """One rung of one or several runs (folder, metrics): the figures of the run of the median PSNR (of an even number the lower
+    of the two in the middle), and ``psnr_of_runs`` in the order of the runs."""
+    folder, metrics = sorted(runs, key=lambda run: run[1]["psnr"])[(len(runs) - 1) // 2]
     row = {"representation": representation, "budget": budget, "run": folder.name}
-    return row | {key: metrics[key] for key in KEPT}
+    return row | {key: metrics[key] for key in KEPT} | {"psnr_of_runs": [m["psnr"] for _, m in runs]}
 
 
 def write_ladder(folder: Path, record: Mapping[str, Any]) -> list[Path]:
@@ -72,16 +81,18 @@ def table(record: Mapping[str, Any]) -> str:
     """The record in Markdown."""
     hardware, rows = record["hardware"], record["rows"]
     size = "×".join(map(str, rows[0]["image_size"]))
+    most = max(len(row["psnr_of_runs"]) for row in rows)
+    several = f"; the run of the median PSNR of {most}, in brackets the range of all" if most > 1 else ""
     lines = [
         f"{record['data']}: {rows[0]['n_images']} held-out views at {size}; {processor(hardware)}, "
-        f"{record['threads']} threads, {hardware['kernel_path']}, nerfvol {record['nerfvol']}",
+        f"{record['threads']} threads, {hardware['kernel_path']}, nerfvol {record['nerfvol']}{several}",
         "",
         "| representation | budget | seconds | PSNR / dB | SSIM | MB | s / frame |",
         "|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {r['representation']} | {r['budget']} | {r['seconds']:.1f} | {r['psnr']:.2f} | {r['ssim']:.4f} | {r['MB']:.1f} "
-        f"| {r['seconds_per_frame']:.3f} |"
+        f"| {r['representation']} | {r['budget']} | {r['seconds']:.1f} | {r['psnr']:.2f}{_range(r['psnr_of_runs'])} "
+        f"| {r['ssim']:.4f} | {r['MB']:.1f} | {r['seconds_per_frame']:.3f} |"
         for r in rows
     ]
     if record["published"]:
@@ -91,8 +102,12 @@ def table(record: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _range(psnr: Sequence[float]) -> str:
+    return f" ({min(psnr):.2f} to {max(psnr):.2f})" if len(psnr) > 1 else ""
+
+
 def ladder_figure(record: Mapping[str, Any]) -> Any:
-    """PSNR with the published figures, and SSIM, against minutes."""
+    """PSNR with the published figures, and SSIM, against minutes; bars: the range over the runs of a rung."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.8), layout="constrained")
@@ -102,6 +117,9 @@ def ladder_figure(record: Mapping[str, Any]) -> Any:
         minutes = [row["seconds"] / 60 for row in rows]
         for place, key in zip(axes, ("psnr", "ssim"), strict=True):
             place.plot(minutes, [row[key] for row in rows], "o-", color=f"C{number}", label=f"nerfvol, {name}")
+        low, high = (np.array([pick(row["psnr_of_runs"]) for row in rows]) for pick in (min, max))
+        if (low < high).any():
+            axes[0].vlines(minutes, low, high, color=f"C{number}", lw=2, alpha=0.5)
     for number, (name, points) in enumerate(record["published"].items()):
         colour = f"C{5 + number}"
         timed = [(seconds / 60, psnr) for seconds, psnr in points if seconds is not None]

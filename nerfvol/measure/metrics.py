@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating]
 
-_WINDOW = 11
-_WINDOW_SIGMA = 1.5
+WINDOW = 11
+"""Pixels along a side of SSIM's window: smaller images have no SSIM."""
+_SIGMA = 1.5
 _K1, _K2 = 0.01, 0.03
 _BAND = 32  # rows at a time: five maps of a band stay in the processor's cache
 
@@ -51,23 +52,23 @@ def ssim(image: Tensor | ArrayLike, reference: Tensor | ArrayLike, seen: NDArray
         InputError: images of two shapes, smaller ones, or values that are not floating point.
     """
     a, b = _pair(image, reference)
-    if a.ndim != 3 or min(a.shape[:2]) < _WINDOW:
+    if a.ndim != 3 or min(a.shape[:2]) < WINDOW:
         raise InputError(f"SSIM needs images (height, width, channels) of at least 11x11 pixels, got shape {a.shape}")
     height, width, channels = a.shape
-    inner = height - _WINDOW + 1
+    inner = height - WINDOW + 1
     if seen is not None:
         return _ssim_where(np.where(seen[..., None], a, b), b, seen)
     total = 0.0
     for channel in range(channels):
         for top in range(0, inner, _BAND):
-            rows = slice(top, min(top + _BAND, inner) + _WINDOW - 1)
+            rows = slice(top, min(top + _BAND, inner) + WINDOW - 1)
             total += float(np.sum(_similarity(a[rows, :, channel], b[rows, :, channel]), dtype=np.float64))
-    return total / (channels * inner * (width - _WINDOW + 1))
+    return total / (channels * inner * (width - WINDOW + 1))
 
 
 def _ssim_where(a: Floats, b: Floats, seen: NDArray[np.bool_]) -> float:
     """The mean similarity of a and b (h, w, channels) over the windows whose middle is ``seen`` (h, w)."""
-    half = _WINDOW // 2
+    half = WINDOW // 2
     middle = seen[half : seen.shape[0] - half, half : seen.shape[1] - half]
     maps = np.stack([_similarity(a[..., channel], b[..., channel]) for channel in range(a.shape[2])], axis=-1)
     return float(np.mean(maps[middle] if middle.any() else maps, dtype=np.float64))
@@ -93,16 +94,16 @@ def _similarity(a: Floats, b: Floats) -> Floats:
 
 def _window_means(maps: Floats) -> Floats:
     """Gaussian-weighted means (n, h - 10, w - 10) of maps (n, h, w): down the columns, then along the rows."""
-    offsets = np.arange(_WINDOW) - _WINDOW // 2
-    weights = np.exp(-0.5 * (offsets / _WINDOW_SIGMA) ** 2)
+    offsets = np.arange(WINDOW) - WINDOW // 2
+    weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     weights = (weights / weights.sum()).astype(maps.dtype)
     for axis in (1, 2):
-        size = maps.shape[axis] - _WINDOW + 1
-        part = [maps[:, j : j + size] if axis == 1 else maps[:, :, j : j + size] for j in range(_WINDOW)]
-        total = part[_WINDOW // 2] * weights[_WINDOW // 2]
+        size = maps.shape[axis] - WINDOW + 1
+        part = [maps[:, j : j + size] if axis == 1 else maps[:, :, j : j + size] for j in range(WINDOW)]
+        total = part[WINDOW // 2] * weights[WINDOW // 2]
         both = np.empty_like(total)
-        for j in range(_WINDOW // 2):  # the window is symmetric
-            np.add(part[j], part[_WINDOW - 1 - j], out=both)
+        for j in range(WINDOW // 2):  # the window is symmetric
+            np.add(part[j], part[WINDOW - 1 - j], out=both)
             both *= weights[j]
             total += both
         maps = total

@@ -34,6 +34,7 @@ from nerfvol.files.run_folder import (
     REFINED,
     UNFINISHED,
 )
+from nerfvol.measure.metrics import WINDOW
 from nerfvol.starts.region import region_of_sweep
 
 Colour = tuple[float, float, float]
@@ -159,6 +160,7 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
         scene=config.scene,
         most=LARGEST_HELD_OUT,
     )
+    require_scorable(held_out)
     first = held_out.evenly(1)
     compared = held_out.evenly(config.compare_views).middles(COMPARED_SIZE)
     reading = 0.0
@@ -211,6 +213,17 @@ def background_of(config: Config, training: Dataset, say: Callable[[str], object
         colour = ",".join(f"{c:.3g}" for c in backdrop)
         say(f"--background is not used while training: the pictures are opaque and have {colour} behind them")
     return config.before(backdrop).background or WHITE
+
+
+def require_scorable(held_out: Dataset) -> None:
+    """An InputError where a held-out view is smaller than the window of SSIM: a run would learn it after its last step."""
+    for name, camera in zip(held_out.names, held_out.cameras, strict=True):
+        lens = camera.intrinsics
+        if min(lens.width, lens.height) < WINDOW:
+            raise InputError(
+                f"{held_out.source}: the held-out view {name} is {lens.width}x{lens.height}, expected {WINDOW}x{WINDOW} pixels "
+                "or more, without which SSIM has no value; take larger pictures or a smaller --downscale"
+            )
 
 
 def require_something(dataset: Dataset, background: Sequence[float]) -> None:

@@ -76,6 +76,7 @@ class SplatTrainer:
         self.steps = config.steps
         self.steps_done, self.stage, self.stage_began = 0, 0, 0
         self.seen_since = 0  # steps since what was not seen was last asked for
+        self.growing = True  # until the first round after growth ends, which brings their number to the planned one
 
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
@@ -120,7 +121,8 @@ class SplatTrainer:
         return {
             **self.state.arrays(), "stage": self.stage, "steps_done": self.steps_done, "stage_began": self.stage_began,
             "started_with": self.started_with, "steps_of_stages": list(self.schedule.steps),
-            "seen_since": self.seen_since, "factors": list(self.schedule.factors), "ends": list(self.schedule.ends),
+            "seen_since": self.seen_since, "growing": self.growing, "factors": list(self.schedule.factors),
+            "ends": list(self.schedule.ends),
             "most": self.schedule.most, "grown": self.schedule.grown, "subject_distance": self.subject_distance,
             "appearance": self.appearance.state_dict(),
         } | ({} if self.motions is None else {"motions": self.motions.state_dict()})  # fmt: skip
@@ -130,6 +132,7 @@ class SplatTrainer:
         self.state = SplatState.from_arrays(state)
         for name in ("stage", "stage_began", "steps_done", "started_with", "seen_since"):
             setattr(self, name, int(state[name]))
+        self.growing = bool(state.get("growing", True))  # checkpoints of earlier versions have none
         self.schedule = saved_schedule(state)
         self.subject_distance = float(state["subject_distance"])
         self.appearance.load_state_dict(state["appearance"])
@@ -230,8 +233,8 @@ class SplatTrainer:
             )
         if not keep.all():
             state.prune(keep)
-        growing = progress < self.schedule.grown
-        wanted = self.schedule.planned(self.started_with, progress) - state.n if growing else 0
+        wanted = self.schedule.planned(self.started_with, progress) - state.n if self.growing else 0
+        self.growing = progress < self.schedule.grown
         state.grow(
             wanted, np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, SPLITS, self.steps_done])))
         )

@@ -46,13 +46,56 @@ def test_a_ladder_of_steps(tmp_path, tiny_scene, command, settings, monkeypatch)
     assert trained[1:] == [str(folder / "octree_20steps")]
 
 
+def test_the_median_of_several_runs(tmp_path, tiny_scene, command, settings, monkeypatch):
+    """Seeds 0, 1 and 2; a ladder that was stopped goes on with what is missing, and what was half done is begun again."""
+    folder = tmp_path / "ladder"
+    arguments = (
+        "bench", "--ladder", tiny_scene, "--out", folder, "--threads", 1, "--settings", settings, "--budgets", "12steps",
+        "--representations", "splats", "--repeats", 3,
+    )  # fmt: skip
+    trained, real = [], train.train
+
+    def stopped_in_the_second(config, **more):
+        trained.append((config.out, config.seed))
+
+        def stop(run, phase, began):
+            if len(trained) == 2 and phase.steps_done == 5:
+                raise KeyboardInterrupt
+
+        return real(config, watch=stop, **more)
+
+    monkeypatch.setattr(train, "train", stopped_in_the_second)
+    assert command(*arguments)[0] != 0 and len(trained) == 2
+    assert command(*arguments)[0] == 0
+    names = [str(folder / name) for name in ("splats_12steps", "splats_12steps_2", "splats_12steps_3")]
+    assert trained == [(names[0], 0), (names[1], 1), (names[1], 1), (names[2], 2)]
+    (row,) = json.loads((folder / "ladder.json").read_text())["rows"]
+    scores = [json.loads((folder / name / "metrics.json").read_text())["psnr"] for name in names]
+    assert row["psnr_of_runs"] == scores and row["psnr"] == sorted(scores)[1]
+    assert row["run"] == names[scores.index(row["psnr"])].rsplit("/", 1)[1] and row["steps"] == {"splats": 12}
+    text = (folder / "ladder.md").read_text()
+    assert f"| {row['psnr']:.2f} ({min(scores):.2f} to {max(scores):.2f}) |" in text and "median PSNR of 3" in text
+
+
 def test_the_picture_shows_the_record():
-    row = {"representation": "octree", "budget": "1m", "seconds": 60.0, "psnr": 30.0, "ssim": 0.9}
+    row = {
+        "representation": "octree",
+        "budget": "1m",
+        "seconds": 60.0,
+        "psnr": 30.0,
+        "ssim": 0.9,
+        "psnr_of_runs": [30.0],
+    }
     record = {"data": "d", "hardware": {"cpu": "c"}, "threads": 2, "rows": [row, row | {"seconds": 6.0, "psnr": 25.0}]}
     psnr, ssim = ladder.ladder_figure(record | {"published": ladder.PUBLISHED["bonsai"]}).axes
     assert psnr.get_lines()[0].get_xydata().tolist() == [[0.1, 25.0], [1.0, 30.0]]
     assert [line.get_ydata()[0] for line in psnr.get_lines()[1:]] == [26.2, 30.5, 32.0]
-    assert len(ssim.get_lines()) == 1
+    assert len(ssim.get_lines()) == 1 and not psnr.collections
+    several = record | {"rows": [row | {"psnr_of_runs": [29.0, 30.0, 32.0]}], "published": {}}
+    psnr, ssim = ladder.ladder_figure(several).axes
+    assert [s.tolist() for s in psnr.collections[0].get_segments()] == [
+        [[1.0, 29.0], [1.0, 32.0]]
+    ] and not ssim.collections
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,14 @@ def test_a_run_is_resumed_with_its_own_pictures_alone(stopped, tmp_path, tiny_sc
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 
+def test_views_too_small_to_score_are_refused_before_the_first_step(tiny_scene, tmp_path, command):
+    """40x40 at a quarter is 10x10, and SSIM's window 11x11."""
+    out = tmp_path / "run"
+    code, text, err = command("train", "--data", tiny_scene, "--downscale", 4, "--out", out, "--set", "octree.steps=3")
+    assert code == 2 and not out.exists() and "training" not in text
+    assert "is 10x10, expected 11x11 pixels" in err and err.count("\n") == 1
+
+
 def test_a_folder_has_one_writer(tmp_path):
     with only_writer(tmp_path, "trains"):
         code = "from nerfvol.files.lock import only_writer; from pathlib import Path; import sys\n" \

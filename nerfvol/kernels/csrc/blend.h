@@ -21,31 +21,40 @@ struct TilePixels {
     }
 };
 
+// A block's pixels come in parts of one register each, some rows of four pixels: what a block's rows share is worked out once,
+// and nothing waits in memory for lack of registers.
+constexpr int kParts = 16 / kWide, kPartRows = kWide / 4;
+
 // A Gaussian as a tile sees it: distances of the first block's pixels from its mean.
 struct Footprint {
-    f16 dx, dy;
+    fwide dx, dy[kParts];
     const Record& g;
-    Footprint(const Record& record, float left, float top)
-        : dx(load<f16>(kLaneX) + (left + 0.5f - record.x)), dy(load<f16>(kLaneY) + (top + 0.5f - record.y)), g(record) {}
+    Footprint(const Record& record, float left, float top) : dx(load<fwide>(kLaneX) + (left + 0.5f - record.x)), g(record) {
+        const fwide rows = load<fwide>(kLaneY) + (top + 0.5f - record.y);
+        for (int part = 0; part < kParts; ++part) dy[part] = rows + float(kPartRows * part);
+    }
 
-    f16 x(int block) const { return dx + kBlockX[block]; }
-    f16 y(int block) const { return dy + kBlockY[block]; }
-    // 0 below 1/255 and where the pixel has ended.
-    f16 alpha(int block, const f16& trans, float eps) const {
-        const f16 px = x(block), py = y(block);
-        const f16 near = px * g.a + py * g.b;
-        const f16 power = (g.log2_opacity - px * near) - py * (py * g.c);
-        const f16 alpha = vmin(vexp2(power), splat16(kAlphaMax)), zero = splat16(0);
-        return select_less(trans, eps, zero, select_less(alpha, kAlphaMin, zero, alpha));
+    fwide x(int block) const { return dx + kBlockX[block]; }
+    fwide y(int block, int part) const { return dy[part] + kBlockY[block]; }
+
+    // The power of two is level - y (c y + slope).
+    struct Across { fwide level, slope; };
+    Across across(const fwide& x) const { return {g.log2_opacity - x * (x * g.a), x * g.b}; }
+    // 0 below 1/255, where the pixel has ended, and where distances are too large for numbers.
+    fwide alpha(const Across& at, const fwide& y, const fwide& trans, float eps) const {
+        const fwide power = at.level - y * (y * g.c + at.slope), zero = splat<fwide>(0);
+        const fwide alpha = vmin(vexp2_normal(power), splat<fwide>(kAlphaMax));
+        return select_less(trans, eps, zero, select_less(splat<fwide>(-kLog2Of255), power, alpha, zero));
     }
 };
 
-// Composites one Gaussian on one block; returns the weights, leaves what passes.
-inline f16 composite_alpha(TilePixels& p, int block, const f16& alpha, const f16& trans, const float* colour, f16& after) {
-    const f16 w = trans * alpha;
+// Composites one Gaussian on a part of a block; returns the weights, leaves what passes.
+inline fwide composite_alpha(TilePixels& p, int block, int part, const fwide& alpha, const fwide& trans, const float* colour, fwide& after) {
+    const int at = kWide * part;
+    const fwide w = trans * alpha;
     after = trans - w;
-    store(p.trans[block], after);
-    for (int c = 0; c < 3; ++c) store(p.colour[c][block], load<f16>(p.colour[c][block]) + w * colour[c]);
+    store(p.trans[block] + at, after);
+    for (int c = 0; c < 3; ++c) store(p.colour[c][block] + at, load<fwide>(p.colour[c][block] + at) + w * colour[c]);
     return w;
 }
 

@@ -22,7 +22,7 @@ class PointBlock {
 public:
     PointBlock(const Frame& f, const PointFrame& p, int64_t tile, int block, float left, float top, Buffer<PointOnBlock>& kept)
         : frame_(f), points_(p), kept_(kept), next_(f.first_entry[size_t(tile)]), end_(f.first_entry[size_t(tile) + 1]),
-          block_(block), left_(left), top_(top), x_(load<f16>(kLaneX) + (left + kBlockX[block] + 0.5f)),
+          block_(block), x_(load<f16>(kLaneX) + (left + kBlockX[block] + 0.5f)),
           y_(load<f16>(kLaneY) + (top + kBlockY[block] + 0.5f)) {}
 
     BlockSums composite(float eps) {
@@ -46,7 +46,6 @@ private:
     uint64_t next_, end_;
     size_t n_ = 0;
     int block_;
-    float left_, top_;
     f16 x_, y_;
 
     // How far the surface that is next reaches; kFar where there is none, and where the pixel has ended.
@@ -73,8 +72,7 @@ private:
     bool read(uint32_t rank, const f16& alive) {
         const Record& g = frame_.sorted[rank];
         const PointRecord& q = points_.points[g.id];
-        const Footprint foot(g, left_, top_);
-        const f16 px = foot.x(block_), py = foot.y(block_), zero = splat16(0);
+        const f16 px = x_ - g.x, py = y_ - g.y, zero = splat16(0);
         const f16 power = px * (px * g.a + py * g.b) + py * (py * g.c);
         f16 weight = select_less(splat16(0.5f * kReach * kReach * kLog2e), power, zero, vexp2(q.log2_weight - power)) * alive;
         if (!greater_bits(weight, zero)) return false;
@@ -170,7 +168,7 @@ inline void render_points(const Splats& splats, const SplatView& view, const Spl
         return project_points(block, view, splats.mip, uint32_t(16 * b), to, records + 16 * b);
     });
     sort_by_depth(frame);
-    make_lists(frame, TileGrid(view));
+    make_lists(frame, TileGrid(view), 16 * splats.n_blocks);
     points.floors.need(size_t(frame.first_entry.back()));
     if (kept.size() < size_t(nerfvol::get_threads())) kept.resize(size_t(nerfvol::get_threads()));
     splat_for(TileGrid(view).size(), [&](int tile, int thread) {

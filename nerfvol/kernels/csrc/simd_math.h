@@ -25,10 +25,10 @@ inline f16 vsqrt(f16 v) { return (f16)_mm512_maskz_sqrt_ps(0xffff, (__m512)v); }
 #endif
 template <class H> inline Pair<H> vsqrt(const Pair<H>& v) { return {vsqrt(v.lo), vsqrt(v.hi)}; }
 
-// 2^x for -126 <= x < 128, relative error 2e-7; below -126 zero or a number that small.
-template <class V> inline V vexp2(const V& given) {
+// 2^x for -126 <= x < 128, relative error 2e-7; anything for other x.
+template <class V> inline V vexp2_normal(const V& x) {
     typedef typename Integers<V>::type I;
-    const V x = vmax(given, splat<V>(-126.0f)), magic = splat<V>(12582912.0f);  // 1.5 * 2^23
+    const V magic = splat<V>(12582912.0f);  // 1.5 * 2^23
     const V shifted = x + magic;
     const V r = x - (shifted - magic);
     V p = splat<V>(1.327648172e-03f);
@@ -37,11 +37,10 @@ template <class V> inline V vexp2(const V& given) {
     p = p * r + 2.402211963e-01f;
     p = p * r + 6.931469670e-01f;
     p = p * r + 1.000000072e+00f;
-    return p * (V)(((I)shifted - (I)magic + 127) << 23);
+    return (V)((I)p + ((I)shifted << 23));   // to the exponent; what is above the integer falls off
 }
-template <class H> inline Pair<H> vexp2(const Pair<H>& x) { return {vexp2(x.lo), vexp2(x.hi)}; }
 #if defined(__AVX512DQ__)
-inline f16 vexp2(const f16& x) {  // x = floor(x) + r in one instruction each way
+inline f16 vexp2_normal(const f16& x) {  // x = floor(x) + r in one instruction each way
     const f16 r = (f16)_mm512_maskz_reduce_ps(0xffff, (__m512)x, 1);
     f16 p = splat16(1.877578051e-03f);
     p = p * r + 8.989343715e-03f;
@@ -52,7 +51,9 @@ inline f16 vexp2(const f16& x) {  // x = floor(x) + r in one instruction each wa
     return (f16)_mm512_maskz_scalef_ps(0xffff, (__m512)p, (__m512)x);
 }
 #endif
-
+// The same; below -126 zero or a number that small.
+template <class V> inline V vexp2(const V& x) { return vexp2_normal(vmax(x, splat<V>(-126.0f))); }
+template <class H> inline Pair<H> vexp2(const Pair<H>& x) { return {vexp2(x.lo), vexp2(x.hi)}; }
 // log2(x) for positive normal x, absolute error 2e-7: x = 2^n m with m in [sqrt(1/2), sqrt(2)), then artanh's series.
 template <class V> inline V vlog2(const V& x) {
     typedef typename Integers<V>::type I;
@@ -75,10 +76,36 @@ inline float sum(const f16& v) {
 }
 
 // The sums of four vectors.
+inline f4 four_sums(f4 a, f4 b, f4 c, f4 d) {
+    const auto pairs = [](f4 x, f4 y) { return __builtin_shufflevector(x, y, 0, 2, 4, 6) + __builtin_shufflevector(x, y, 1, 3, 5, 7); };
+    return pairs(pairs(a, b), pairs(c, d));
+}
+#if defined(__AVX__)
+inline f4 four_sums(const f8& a, const f8& b, const f8& c, const f8& d) {
+    const auto pairs = [](f8 x, f8 y) {      // within each half: no register is crossed
+        return __builtin_shufflevector(x, y, 0, 2, 8, 10, 4, 6, 12, 14) + __builtin_shufflevector(x, y, 1, 3, 9, 11, 5, 7, 13, 15);
+    };
+    const f8 sums = pairs(pairs(a, b), pairs(c, d));
+    return (f4)_mm256_castps256_ps128((__m256)sums) + (f4)_mm256_extractf128_ps((__m256)sums, 1);
+}
+#endif
+#if defined(__AVX512F__)
 inline f4 four_sums(const f16& a, const f16& b, const f16& c, const f16& d) {
     const auto fold = [](const f16& v) { return (quarter<0>(v) + quarter<1>(v)) + (quarter<2>(v) + quarter<3>(v)); };
-    const auto pairs = [](f4 x, f4 y) { return __builtin_shufflevector(x, y, 0, 2, 4, 6) + __builtin_shufflevector(x, y, 1, 3, 5, 7); };
-    return pairs(pairs(fold(a), fold(b)), pairs(fold(c), fold(d)));
+    return four_sums(fold(a), fold(b), fold(c), fold(d));
 }
+#endif
+
+// The largest of a vector's numbers.
+inline float largest_of(f4 v) {
+    v = vmax(v, __builtin_shufflevector(v, v, 2, 3, 0, 1));
+    return v[0] > v[1] ? v[0] : v[1];
+}
+#if defined(__AVX__)
+inline float largest_of(const f8& v) { return -least(-v); }
+#endif
+#if defined(__AVX512F__)
+inline float largest_of(const f16& v) { return -least(-v); }
+#endif
 
 }  // namespace NERFVOL_ISA

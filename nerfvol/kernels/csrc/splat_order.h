@@ -24,12 +24,12 @@ struct TileEntry {
     uint32_t mask() const { return uint32_t(bits) & 0xffff; }
 };
 
-struct Place { uint32_t first, count; };     // slots of a Gaussian; count 0: it was not seen
+struct Place { uint32_t first, count; };     // slots of a Gaussian; count 0: it is in no tile
 
 struct RangeLists {
     Buffer<TileMask> tiles;
     std::vector<uint32_t> counts;            // of each tile; then where the range's part of its list begins
-    size_t n = 0, base = 0;                  // entries; slots before this range
+    size_t n = 0;                            // entries
 };
 
 // What the passes of one picture share. Kept between pictures for its memory.
@@ -133,9 +133,9 @@ inline void list_range(Frame& f, const TileGrid& grid, int64_t first, int64_t la
         if (rank + kAhead < last) __builtin_prefetch(&f.projected[uint32_t(f.keys[size_t(rank + kAhead)])]);
         Record g = f.projected[uint32_t(f.keys[size_t(rank)])];
         TileMask* out = range.tiles.need_keeping(range.n + most_tiles(g, grid), range.n) + range.n;
-        g.first = uint32_t(range.n);
         g.count = uint32_t(list_tiles(g, grid, out, [&](uint32_t tile) { ++range.counts[tile]; }));
         range.n += g.count;
+        f.places[g.id].count = g.count;
         f.sorted[size_t(rank)] = g;
     }
 }
@@ -149,11 +149,18 @@ inline void place_ranges(Frame& f, int64_t tiles) {
         for (RangeLists& r : f.ranges) sum += std::exchange(r.counts[t], uint32_t(sum));
     }
     f.first_entry[size_t(tiles)] = sum;
-    size_t base = 0;
-    for (RangeLists& r : f.ranges) { r.base = base; base += r.n; }
 }
 
-inline void make_lists(Frame& f, const TileGrid& grid) {
+// Slots lie in the order of the Gaussians, as neighbours in space do: a tile writes to, and a block reads from, few pages.
+inline void place_slots(Frame& f, int64_t n) {
+    uint32_t first = 0;
+    for (int64_t i = 0; i < n; ++i) {
+        f.places[size_t(i)].first = first;
+        first += f.places[size_t(i)].count;
+    }
+}
+
+inline void make_lists(Frame& f, const TileGrid& grid, int64_t n) {
     const int64_t ranges = std::clamp<int64_t>(f.visible / 2048, 1, 32);
     f.ranges.resize(size_t(ranges));
     f.sorted.need(size_t(f.visible));
@@ -161,14 +168,14 @@ inline void make_lists(Frame& f, const TileGrid& grid) {
         list_range(f, grid, part(f.visible, ranges, r), part(f.visible, ranges, r + 1), f.ranges[size_t(r)]);
     });
     place_ranges(f, grid.size());
+    place_slots(f, n);
     TileEntry* entries = f.entries.need(size_t(f.first_entry.back()));
     splat_for(ranges, [&](int r, int) {
         RangeLists& range = f.ranges[size_t(r)];
         const TileMask* at = range.tiles.data();
         for (int64_t rank = part(f.visible, ranges, r); rank < part(f.visible, ranges, r + 1); ++rank) {
             Record& g = f.sorted[size_t(rank)];
-            g.first += uint32_t(range.base);
-            f.places[g.id] = {g.first, g.count};
+            g.first = f.places[g.id].first;
             for (uint32_t k = 0; k < g.count; ++k, ++at) entries[range.counts[at->tile]++] = TileEntry(uint32_t(rank), k, at->mask);
         }
     });
@@ -178,7 +185,7 @@ inline void make_lists(Frame& f, const TileGrid& grid) {
 template <int K> void prepare_frame(const Splats& splats, const SplatView& view, Frame& f, bool with_normals) {
     project_all<K>(splats, view, f, with_normals);
     sort_by_depth(f);
-    make_lists(f, TileGrid(view));
+    make_lists(f, TileGrid(view), 16 * splats.n_blocks);
 }
 
 }  // namespace NERFVOL_ISA

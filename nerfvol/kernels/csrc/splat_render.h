@@ -11,12 +11,13 @@ using nerfvol::SplatRenderOptions;
 struct TileExtras {
     alignas(64) float depth[16][16] = {}, median[16][16] = {}, normal[3][16][16] = {};
 
-    void add(int block, const f16& w, const f16& before, const f16& after, float z, const float* n) {
-        store(depth[block], load<f16>(depth[block]) + w * z);
-        const f16 half = splat16(0.5f), old = load<f16>(median[block]), now = splat16(z);
+    void add(int block, int part, const fwide& w, const fwide& before, const fwide& after, float z, const float* n) {
+        const int at = kWide * part;
+        store(depth[block] + at, load<fwide>(depth[block] + at) + w * z);
+        const fwide half = splat<fwide>(0.5f), old = load<fwide>(median[block] + at), now = splat<fwide>(z);
         // before > 1/2 >= after; T falls only once, so what is set stays.
-        store(median[block], select_less(half, before, select_less(half, after, old, now), old));
-        for (int c = 0; c < 3; ++c) store(normal[c][block], load<f16>(normal[c][block]) + w * n[c]);
+        store(median[block] + at, select_less(half, before, select_less(half, after, old, now), old));
+        for (int c = 0; c < 3; ++c) store(normal[c][block] + at, load<fwide>(normal[c][block] + at) + w * n[c]);
     }
 };
 
@@ -51,11 +52,17 @@ void render_tile(Frame& f, const SplatView& v, int64_t tile, const SplatRenderOp
         const Footprint foot(g, float(left), float(top));
         for (; blocks; blocks &= blocks - 1) {
             const int block = __builtin_ctz(blocks);
-            const f16 trans = load<f16>(p.trans[block]);
-            f16 after;
-            const f16 w = composite_alpha(p, block, foot.alpha(block, trans, eps), trans, g.colour, after);
-            if (Extras) extras.add(block, w, trans, after, g.z, f.normals.data() + 4 * size_t(g.id));
-            if (!greater_bits(after, splat16(eps))) alive &= ~(1u << block);
+            const auto across = foot.across(foot.x(block));
+            uint32_t open = 0;
+            for (int part = 0; part < kParts; ++part) {
+                const fwide trans = load<fwide>(p.trans[block] + kWide * part);
+                const fwide alpha = foot.alpha(across, foot.y(block, part), trans, eps);
+                fwide after;
+                const fwide w = composite_alpha(p, block, part, alpha, trans, g.colour, after);
+                if (Extras) extras.add(block, part, w, trans, after, g.z, f.normals.data() + 4 * size_t(g.id));
+                open |= greater_bits(after, splat<fwide>(eps));
+            }
+            if (!open) alive &= ~(1u << block);
         }
     });
     for (int block = 0; block < 16; ++block) {

@@ -13,8 +13,8 @@ namespace NERFVOL_ISA {
 enum LineSum { kH, kHx, kHy, kHxx, kHxy, kHyy, kWg, kWe = 9, kSums, kMaxWeight = 12 };
 struct alignas(64) Line { float sums[16]; };
 
-struct KeptBlock { f16 weight, alpha; };
-struct KeptEntry { uint64_t entry; uint32_t blocks; bool line; };
+struct KeptBlock { float weight[16], alpha[16]; };
+struct KeptEntry { uint32_t rank, slot, blocks; float largest; };   // largest weight; negative: no line
 
 // A thread's memory for one tile.
 struct TileWork {
@@ -31,27 +31,38 @@ struct StepLines {
     Buffer<uint8_t> left;
 };
 
+// One Gaussian on the blocks of a tile; returns the largest weight, and takes the blocks that have ended from `alive`.
+inline fwide forward_entry(const Footprint& foot, uint32_t blocks, float eps, TilePixels& p, KeptBlock* kept, uint32_t& alive) {
+    fwide largest = splat<fwide>(0);
+    for (; blocks; blocks &= blocks - 1, ++kept) {
+        const int block = __builtin_ctz(blocks);
+        const auto across = foot.across(foot.x(block));
+        uint32_t open = 0;
+        for (int part = 0; part < kParts; ++part) {
+            const int at = kWide * part;
+            const fwide trans = load<fwide>(p.trans[block] + at), alpha = foot.alpha(across, foot.y(block, part), trans, eps);
+            fwide after;
+            const fwide w = composite_alpha(p, block, part, alpha, trans, foot.g.colour, after);
+            store(kept->weight + at, w);
+            store(kept->alpha + at, alpha);
+            largest = vmax(largest, w);
+            open |= greater_bits(after, splat<fwide>(eps));
+        }
+        if (!open) alive &= ~(1u << block);
+    }
+    return largest;
+}
+
 inline void forward_tile(const Frame& f, int64_t tile, float left, float top, uint32_t alive, const SplatLoss& loss, TileWork& work) {
     work.n_blocks = work.n_entries = 0;
-    TilePixels& p = work.pixels;
-    const float eps = loss.early_stop_eps;
     walk_tile(f, tile, alive, [&](uint64_t e, const Record& g, uint32_t blocks) {
-        const Footprint foot(g, left, top);
-        f16 largest = splat16(0);
         KeptBlock* kept = work.blocks.need_keeping(work.n_blocks + 16, work.n_blocks) + work.n_blocks;
-        for (uint32_t todo = blocks; todo; todo &= todo - 1, ++kept) {
-            const int block = __builtin_ctz(todo);
-            const f16 trans = load<f16>(p.trans[block]), alpha = foot.alpha(block, trans, eps);
-            f16 after;
-            const f16 w = composite_alpha(p, block, alpha, trans, g.colour, after);
-            store(&kept->weight, w);
-            store(&kept->alpha, alpha);
-            largest = vmax(largest, w);
-            if (!greater_bits(after, splat16(eps))) alive &= ~(1u << block);
-        }
+        const fwide w = forward_entry(Footprint(g, left, top), blocks, loss.early_stop_eps, work.pixels, kept, alive);
         work.n_blocks += size_t(__builtin_popcount(blocks));
-        const bool line = greater_bits(largest, splat16(loss.weight_threshold)) != 0;
-        work.entries.need_keeping(work.n_entries + 1, work.n_entries)[work.n_entries] = {e, blocks, line};
+        const TileEntry entry = f.entries[e];
+        const bool line = greater_bits(w, splat<fwide>(loss.weight_threshold)) != 0;
+        work.entries.need_keeping(work.n_entries + 1, work.n_entries)[work.n_entries] = {
+            entry.rank(), g.first + entry.offset(), blocks, line ? largest_of(w) : -1};
         ++work.n_entries;
     });
 }
@@ -70,57 +81,64 @@ inline void loss_of_tile(const SplatImage& image, int64_t left, int64_t top, uin
     }
 }
 
-inline f16 cotangent(const TileWork& work, int block, const Record& g) {
-    return load<f16>(work.g[0][block]) * g.colour[0] + load<f16>(work.g[1][block]) * g.colour[1] + load<f16>(work.g[2][block]) * g.colour[2];
+// Steps over one Gaussian on a part of a block: S, alpha and d = q - S.
+inline fwide step_behind(const Record& g, int block, int at, const fwide& alpha, TileWork& work) {
+    const fwide q = load<fwide>(work.g[0][block] + at) * g.colour[0] + load<fwide>(work.g[1][block] + at) * g.colour[1]
+                  + load<fwide>(work.g[2][block] + at) * g.colour[2];
+    const fwide s = load<fwide>(work.behind[block] + at), d = q - s;
+    store(work.behind[block] + at, s + alpha * d);
+    return d;
 }
 
 inline void pass_behind(const Record& g, uint32_t blocks, const KeptBlock* kept, TileWork& work) {
-    for (; blocks; blocks &= blocks - 1, ++kept) {
-        const int block = __builtin_ctz(blocks);
-        const f16 s = load<f16>(work.behind[block]);
-        store(work.behind[block], s + load<f16>(&kept->alpha) * (cotangent(work, block, g) - s));
-    }
+    for (; blocks; blocks &= blocks - 1, ++kept)
+        for (int at = 0; at < 16; at += kWide) step_behind(g, __builtin_ctz(blocks), at, load<fwide>(kept->alpha + at), work);
 }
 
-inline void leave_line(const Record& g, uint32_t blocks, const KeptBlock* kept, float left, float top, TileWork& work, Line& out) {
-    const Footprint foot(g, left, top);
-    f16 s[kSums];
-    for (f16& v : s) v = splat16(0);
-    f16 largest = splat16(0);
+inline void leave_line(const Footprint& foot, uint32_t blocks, const KeptBlock* kept, TileWork& work, float* out) {
+    fwide s[kSums];
+    for (fwide& v : s) v = splat<fwide>(0);
     for (; blocks; blocks &= blocks - 1, ++kept) {
         const int block = __builtin_ctz(blocks);
-        const f16 behind = load<f16>(work.behind[block]), alpha = load<f16>(&kept->alpha), w = load<f16>(&kept->weight);
-        const f16 d = cotangent(work, block, g) - behind;
-        store(work.behind[block], behind + alpha * d);
-        const f16 h = select_less(alpha, kAlphaMax, w * d, splat16(0));  // a clamped alpha has no gradient
-        const f16 x = foot.x(block), y = foot.y(block), hx = h * x, hy = h * y;
+        const fwide x = foot.x(block);
+        fwide h = splat<fwide>(0), hy = splat<fwide>(0);     // of all parts: x is the same in them
+        for (int part = 0; part < kParts; ++part) {
+            const int at = kWide * part;
+            const fwide alpha = load<fwide>(kept->alpha + at), w = load<fwide>(kept->weight + at), y = foot.y(block, part);
+            const fwide d = step_behind(foot.g, block, at, alpha, work);
+            const fwide own = select_less(alpha, kAlphaMax, w * d, splat<fwide>(0));  // a clamped alpha has no gradient
+            const fwide own_y = own * y;
+            h += own;
+            hy += own_y;
+            s[kHyy] += own_y * y;
+            for (int c = 0; c < 3; ++c) s[kWg + c] += w * load<fwide>(work.g[c][block] + at);
+            s[kWe] += w * load<fwide>(work.error[block] + at);
+        }
+        const fwide hx = h * x;
         s[kH] += h;
         s[kHx] += hx;
         s[kHy] += hy;
         s[kHxx] += hx * x;
-        s[kHxy] += hx * y;
-        s[kHyy] += hy * y;
-        for (int c = 0; c < 3; ++c) s[kWg + c] += w * load<f16>(work.g[c][block]);
-        s[kWe] += w * load<f16>(work.error[block]);
-        largest = vmax(largest, w);
+        s[kHxy] += hy * x;
     }
-    store(out.sums, four_sums(s[0], s[1], s[2], s[3]));
-    store(out.sums + 4, four_sums(s[4], s[5], s[6], s[7]));
-    store(out.sums + 8, four_sums(s[8], s[9], s[9], s[9]));
-    out.sums[kMaxWeight] = -least(-largest);
+    store(out, four_sums(s[0], s[1], s[2], s[3]));
+    store(out + 4, four_sums(s[4], s[5], s[6], s[7]));
+    store(out + 8, four_sums(s[8], s[9], s[9], s[9]));
 }
 
 inline void backward_tile(const Frame& f, StepLines& lines, float left, float top, TileWork& work) {
+    constexpr size_t kAhead = 4;
     const KeptBlock* kept = work.blocks.data() + work.n_blocks;
     for (size_t i = work.n_entries; i-- > 0;) {
         const KeptEntry& e = work.entries[i];
-        const TileEntry entry = f.entries[e.entry];
-        const Record& g = f.sorted[entry.rank()];
+        if (i >= kAhead) __builtin_prefetch(&lines.lines[work.entries[i - kAhead].slot], 1);
+        const Record& g = f.sorted[e.rank];
         kept -= __builtin_popcount(e.blocks);
-        if (!e.line) { pass_behind(g, e.blocks, kept, work); continue; }
-        const size_t slot = size_t(g.first) + entry.offset();
-        leave_line(g, e.blocks, kept, left, top, work, lines.lines[slot]);
-        lines.left[slot] = 1;
+        if (e.largest < 0) { pass_behind(g, e.blocks, kept, work); continue; }
+        float* line = lines.lines[e.slot].sums;
+        leave_line(Footprint(g, left, top), e.blocks, kept, work, line);
+        line[kMaxWeight] = e.largest;
+        lines.left[e.slot] = 1;
     }
 }
 
