@@ -251,6 +251,9 @@ class OctreeConfig(Checked):
     """Weight of the per-sample colour term at the start."""
     distortion: Weight = 0.05
     """Weight of the distortion term at the start."""
+    sparsity: Weight | None = None
+    """Weight of the logarithms of the segments' weights, reached where the rates begin to fall: haze on a ray costs as much as
+    a surface, so that what is left are surfaces, and rays with fewer segments. None: 0, and 3e-4 in photographs."""
     tv_density: Weight | None = None
     """Weight of differences of raw density between the corners of leaves (reference.roughness). None: 6e-5, and 2e-5 in
     photographs."""
@@ -303,13 +306,16 @@ class OctreeConfig(Checked):
 
         Where nobody chose the stages, none averages pictures below SMALLEST_PICTURE: the rays of a tile of 4x4-pixel pictures
         cover the whole field of view, which makes a step ten times as long and teaches nothing. Nor are leaves asked for that
-        are smaller than half a pixel, and of stages that become alike the last is left, with one pruning each before it.
+        are smaller than half a pixel, and of stages that become alike the last is left, with one pruning each before it. Larger
+        pictures than the stages were made for have stages of finer leaves after them, in a half of what the last one had, each.
         """
         plain = OctreeConfig()
         names = ("levels", "downscales", "stage_ends", "tiles", "prunes")
         most = max(1, side // SMALLEST_PICTURE)
-        if any(getattr(self, name) != getattr(plain, name) for name in names) or most >= max(self.downscales):
+        if any(getattr(self, name) != getattr(plain, name) for name in names):
             return self
+        if most >= max(self.downscales):
+            return self._with_levels_to(min(finest_level(side), FINEST_LEVEL))
         factor, level = 1 << (most.bit_length() - 1), max(self.levels[0], finest_level(side))
         rows = [(min(row[0], level), min(row[1], factor), *row[2:])
                 for row in zip(*(getattr(self, name) for name in names), strict=True)]  # fmt: skip
@@ -320,6 +326,18 @@ class OctreeConfig(Checked):
         columns["prunes"] = [min(n, 1) for n in columns["prunes"][:-1]] + columns["prunes"][-1:]
         return dataclasses.replace(self, **columns)
 
+    def _with_levels_to(self, finest: int) -> OctreeConfig:
+        """The same with one more stage for each level after the last one's, to ``finest``."""
+        levels, ends = [*self.levels], [*self.stage_ends]
+        for level in range(levels[-1] + 1, finest + 1):
+            levels.append(level)
+            ends[-1:] = [(([0.0, *ends])[-2] + 1) / 2, 1.0]
+        more = len(levels) - len(self.levels)
+        again = {
+            name: [*getattr(self, name), *getattr(self, name)[-1:] * more] for name in ("downscales", "tiles", "prunes")
+        }
+        return dataclasses.replace(self, levels=levels, stage_ends=ends, **again) if more else self
+
 
 def finest_level(side: int) -> int:
     """Of leaves that pictures of ``side`` pixels along their shorter side can show: no smaller than half a pixel."""
@@ -327,9 +345,9 @@ def finest_level(side: int) -> int:
 
 
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,
-           "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000}  # fmt: skip
+           "sparsity": 0.0, "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000}  # fmt: skip
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
-               "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
+               "sparsity": 3e-4, "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
 """Settings of an octree where nothing else is said."""
 FEW_VIEWS = {"tv_density": 3e-4, "tv_sh": 3e-4, "tv_from": 0}
 """... and of an object that few views show, which begins as a field (docs/experiments.md)."""
@@ -344,6 +362,7 @@ class SceneChoices:
     decay_from: float
     coarse_error: float
     growing_error: float
+    sparsity: float
     tv_density: float
     tv_sh: float
     tv_from: int
