@@ -60,7 +60,7 @@ def _settings(made: Any, given: FieldLoss | FieldRates) -> Any:
 def _check_loss(loss: FieldLoss) -> Any:
     check_background(loss.background)
     check_early_stop(loss.early_stop_eps)
-    weights = (loss.colour, loss.distortion, loss.entropy)
+    weights = (loss.colour, loss.distortion, loss.entropy, loss.negligible)
     if not np.isfinite(weights).all() or min(weights) < 0:
         raise ValueError(f"weights of the loss must be finite and not negative, got {loss}")
     compiled = native()

@@ -29,13 +29,18 @@ COARSE = 4
 
 @dataclass(frozen=True)
 class FieldLoss:
-    """Weights of the loss's terms, see field_reference.loss. A ray ends with the sample behind which T < early_stop_eps."""
+    """Weights of the loss's terms, see field_reference.loss. A ray ends with the sample behind which T < early_stop_eps.
+
+    negligible: share of the mean gradient of a chunk's samples below which one takes part with a probability in proportion and
+    counts so much more, so that gradients are exact on average [Russian roulette, Arvo and Kirk 1990]. 0: all take part.
+    """
 
     background: tuple[float, float, float] = WHITE
     colour: float = 0.0
     distortion: float = 0.0
     entropy: float = 0.0
     early_stop_eps: float = 1e-3
+    negligible: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,10 @@ class FieldState:
                 zeros[...] = 0
                 setattr(self, name + part, zeros)
         self.updates = np.zeros(self.n_levels + 1, np.int64)
+
+    def use_levels(self, n: int) -> None:
+        """Only the ``n`` coarsest levels of the grid from now on: the others' features are zero, and nothing moves them."""
+        self.kernel_shape.use_levels(n)
 
     @property
     def n_levels(self) -> int:
@@ -234,6 +243,13 @@ class Occupancy:
         """A cell that was looked at keeps max(decay * old, largest seen); cells may repeat."""
         self.sigmas[cells] = self.sigmas[cells] * np.float32(decay)  # repeated cells write the same number
         np.maximum.at(self.sigmas, cells, sigmas)
+
+    def note_blocks(self, sigmas: Float, decay: float = 0.8) -> None:
+        """The same of all cells at once: ``sigmas`` (cubes * (r / 2)**3,) was seen in each block of 2**3 cells."""
+        r = self.resolution
+        of_cells = self.sigmas.reshape(self.cubes, r // 2, 2, r // 2, 2, r // 2, 2)
+        of_cells *= np.float32(decay)
+        np.maximum(of_cells, sigmas.reshape(self.cubes, r // 2, 1, r // 2, 1, r // 2, 1), out=of_cells)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps, not copied: sigmas, occupied, coarse."""

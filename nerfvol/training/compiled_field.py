@@ -30,11 +30,18 @@ if TYPE_CHECKING:
 
 MOST_RAYS = 32768
 """Of one step, while most of space is known to be empty."""
-COARSE_STEPS = ((64, 4), (256, 2))
+COARSE_STEPS = ((32, 4), (128, 2))
 """Until so many steps are done, steps along rays are so many times longer: all cells are occupied then."""
-SWEEPS = (64, 128, 256)
+COARSE_LEVELS = ((32, 4), (128, 6))
+"""Until so many steps are done, only so many levels of the grid are in use: haze of all space would move all entries of finer
+ones, and nothing is known that fine."""
+NEGLIGIBLE = 0.25
+"""Samples whose gradient is below this share of the mean one play Russian roulette: half of the samples have a fiftieth of the
+gradient, and the backward pass is half of a step."""
+SWEEPS = (32, 64, 128)
 """After so many steps the whole region is looked at, one point a block of 2**3 cells ..."""
-THINNED, THIN_DECAY = (300, 340, 380, 420, 460, 500, 600, 700, 850, 1000, 1300, 1600, 2000, 3000, 5000), 0.5
+THINNED = (160, 200, 240, 280, 320, 380, 440, 500, 600, 700, 850, 1000, 1300, 1600, 2000, 3000, 5000)
+THIN_DECAY = 0.5
 """... after so many, every occupied cell, and what was seen of it before counts by this factor: haze of the first steps would
 stay occupied for thousands of steps, and be half of the samples; ..."""
 PROBE_EVERY, PROBES = 64, 32768
@@ -181,6 +188,7 @@ class CompiledFieldTrainer:
 
     def trained_field(self) -> CompiledField:
         """The field without what it holds in space that training skips: what is to be rendered or distilled."""
+        self.state.use_levels(self.state.n_levels)  # as it will be read from a file
         return CompiledField(self.state, self.march, self.background)
 
     def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -207,6 +215,8 @@ class CompiledFieldTrainer:
         batch = self._bank(config.downscales[stage]).sample(self.n_rays, self.seed, self.steps_done)
         longer = next((factor for until, factor in COARSE_STEPS if self.steps_done < until), 1)
         self.march = self.march.with_steps(max(8, config.march_steps[stage] // longer))
+        levels = next((n for until, n in COARSE_LEVELS if self.steps_done < until), self.state.n_levels)
+        self.state.use_levels(min(levels, self.state.n_levels))
         moves = [level < SLOW_LEVELS or self.steps_done % SLOW_EVERY == 1 for level in range(self.state.n_levels)]
         report = field_ops.train_step(self.state, batch, self.march, self._loss(progress), self._rates(progress), moves)
         self.steps_done += 1
@@ -221,7 +231,8 @@ class CompiledFieldTrainer:
     def _loss(self, progress: float) -> FieldLoss:
         config, fading = self.config, 0.1**progress
         entropy = config.few_entropy if self.few else config.entropy_weight
-        return FieldLoss(self.background, fading * config.colour_weight, fading * config.distortion_weight, entropy)
+        colour, distortion = fading * config.colour_weight, fading * config.distortion_weight
+        return FieldLoss(self.background, colour, distortion, entropy, negligible=NEGLIGIBLE)
 
     def _rates(self, progress: float) -> FieldRates:
         config = self.config
@@ -236,9 +247,7 @@ class CompiledFieldTrainer:
         if self.steps_done in SWEEPS:
             blocks = np.stack(np.unravel_index(np.arange(grid.cubes * (r // 2) ** 3), (grid.cubes, *[r // 2] * 3)), 1)
             low = np.ravel_multi_index((blocks[:, 0], *(2 * blocks[:, 1:].T)), (grid.cubes, r, r, r))
-            seen = self._seen(low, 2)
-            for offset in np.ndindex(2, 2, 2):
-                grid.note(low + (offset[0] * r + offset[1]) * r + offset[2], seen)
+            grid.note_blocks(self._seen(low, 2))
         elif self.steps_done in THINNED:
             held = np.flatnonzero(grid.cells().reshape(-1))
             grid.note(held, self._seen(held, 1), THIN_DECAY)

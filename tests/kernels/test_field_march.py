@@ -62,6 +62,18 @@ def test_the_threshold_is_never_above_half_the_mean(compiled):
     assert grid.fraction == 0.5
 
 
+def test_notes_of_blocks_are_those_of_their_cells():
+    grids = [Occupancy(fields.OUTSIDE, 8) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    seen = rng.random((grids[0].cubes, 4, 4, 4)).astype(np.float32)
+    for grid in grids:
+        grid.sigmas[...] = np.random.default_rng(1).random(len(grid.sigmas))
+    grids[0].note_blocks(seen.reshape(-1))
+    cells = np.kron(seen, np.ones((1, 2, 2, 2), np.float32)).reshape(-1)
+    grids[1].note(np.arange(len(cells)), cells)
+    assert np.array_equal(grids[0].sigmas, grids[1].sigmas)
+
+
 def test_notes_keep_the_largest_of_repeated_cells():
     grid = Occupancy(fields.INSIDE, 8)
     grid.sigmas[5] = 10

@@ -19,7 +19,7 @@ def assert_same_bits(a: FieldState, b: FieldState) -> None:
 
 
 def trained(n_rays: int = 700, steps: int = 4, resume_at: int | None = None) -> tuple[FieldState, list]:
-    """Enough rays for several chunks a group; levels move in turns."""
+    """Enough rays for several chunks a group; levels move in turns, small gradients play roulette."""
     state, reports = fields.field(fields.SHAPES["default"]), []
     march = fields.scattered(share=0.2)
     for k in range(steps):
@@ -28,7 +28,9 @@ def trained(n_rays: int = 700, steps: int = 4, resume_at: int | None = None) -> 
             state = FieldState(state.domain, state.shape, seed=9)
             state.load_arrays(saved)
         moves = [level < 3 or k % 2 == 1 for level in range(state.n_levels)]
-        reports.append(field_ops.train_step(state, fields.rays(n_rays, seed=k), march, fields.ALL_TERMS, RATES, moves))
+        state.use_levels(5 if k == 0 else state.n_levels)
+        terms = dataclasses.replace(fields.ALL_TERMS, negligible=0.5)
+        reports.append(field_ops.train_step(state, fields.rays(n_rays, seed=k), march, terms, RATES, moves))
     return state, reports
 
 
@@ -130,6 +132,51 @@ def test_numbers_stay_finite(isa, scale, density):
     assert finite or scale > 1e6
     out = field_ops.render_rays(state, fields.rays(40).rays_o, fields.rays(40).rays_d, march, (1, 1, 1))
     assert np.isfinite(out["opacity"]).all() and (out["opacity"] >= 0).all() and (out["opacity"] <= 1).all()
+
+
+def test_the_roulette_expects_the_gradient(compiled):
+    """The mean of many draws, which differ, is the gradient. The draws are by the jitter of each range's first ray, which here
+    meets nothing."""
+    state, march = fields.field(fields.HASHED), fields.everywhere()
+    batch = fields.rays(80, seed=1)
+    batch.rays_o[::5] += 1000
+    exact = np.concatenate([g.ravel() for g in field_ops.loss_gradient(state, batch, march, fields.ALL_TERMS)[:2]])
+    terms, draws = dataclasses.replace(fields.ALL_TERMS, negligible=1.0), []
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        batch.jitter[::5] = rng.random(16)
+        table, network, _ = field_ops.loss_gradient(state, batch, march, terms)
+        draws.append(np.concatenate([table.ravel(), network.ravel()]))
+    error, spread = np.mean(draws, 0) - exact, np.std(draws, 0) / np.sqrt(len(draws))
+    # The network's sums over all samples are nearly normal, entries that few draws reach are not: those are judged together.
+    n = state.network.size
+    assert (np.abs(error[-n:]) <= 5 * spread[-n:] + 1e-6 * np.abs(exact[-n:]).max()).all()
+    assert np.linalg.norm(error) < 3 * np.linalg.norm(spread)
+    assert np.linalg.norm(spread) > 1e-3 * np.linalg.norm(exact)  # rounding alone: 1e-7
+
+
+@pytest.mark.parametrize("levels", [0, 1, 3])
+def test_levels_that_are_not_in_use(isa, levels):
+    """As if their entries were zero, but they keep their values, moments and counts."""
+    state = fields.field(fields.SHAPES["default"])
+    march, batch = fields.everywhere(), fields.rays(50)
+    zeroed = FieldState(state.domain, state.shape)
+    zeroed.load_arrays(state.arrays())
+    assert state.levels is not None
+    zeroed.table[state.levels.starts[levels] :] = 0
+    state.use_levels(levels)
+    points = batch.rays_o + batch.rays_d
+    for mine, theirs in zip(field_ops.evaluate(state, points), field_ops.evaluate(zeroed, points), strict=True):
+        assert np.array_equal(mine, theirs)
+    before = state.table.copy()
+    reports = [field_ops.train_step(s, batch, march, fields.ALL_TERMS, RATES) for s in (state, zeroed)]
+    assert reports[0] == reports[1]
+    split = state.levels.starts[levels]
+    assert np.array_equal(state.network, zeroed.network) and np.array_equal(state.table[:split], zeroed.table[:split])
+    assert np.array_equal(state.table[split:], before[split:]) and not state.table_second[split:].any()
+    assert (state.updates[:-1] == (np.arange(state.n_levels) < levels)).all() and state.updates[-1] == 1
+    with pytest.raises(ValueError, match="more levels"):
+        state.use_levels(state.n_levels + 1)
 
 
 def test_moments_of_the_untouched_stay(compiled):

@@ -33,6 +33,7 @@ struct FieldLayer {
 struct FieldShape {
     bool hashed = true, sh_head = true, softplus = false;
     int levels = 0, features = 0, dense = 0;     // dense: levels that store every vertex
+    int active = 0;                              // coarse levels in use: the others' features are zero, and nothing moves them
     int resolution[kFieldLevels];
     int64_t start[kFieldLevels + 1];             // first entry of each level
     uint32_t bricks = 0;                         // of a hashed level, a power of two
@@ -66,6 +67,7 @@ struct FieldLoss {
     float background[3] = {1, 1, 1};
     float colour = 0, distortion = 0, entropy = 0;
     float early_stop_eps = 1e-3f;
+    float negligible = 0;                        // times the mean gradient of the samples of a chunk: below it a roulette decides
 };
 
 struct FieldRates {                              // Adam; decays are added to the gradient of what has one

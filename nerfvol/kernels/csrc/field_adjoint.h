@@ -86,24 +86,66 @@ inline ChunkLoss adjoint(const Chunk& c, const FieldRays& rays, int64_t from, co
     return sum;
 }
 
-// Takes what lies behind the end of its ray out of the chunk, in place: a third of its samples, which have no part in anything.
-inline void drop_unused(Chunk& c, SampleGradients& d) {
+// Decorrelated bits of a number [Wellons 2018, lowbias32].
+inline uint32_t scrambled(uint32_t x) {
+    x = (x ^ x >> 16) * 0x7feb352du;
+    x = (x ^ x >> 15) * 0x846ca68bu;
+    return x ^ x >> 16;
+}
+
+// How much of a sample's gradient goes backwards, by Russian roulette [Arvo and Kirk 1990]: one below `least` stays with a
+// probability in proportion to it and is then as large as `least`, so that the sum's expectation is what it was.
+struct Roulette {
+    float least = 0;
+    uint32_t seed = 0;
+
+    float factor(float size, int sample) const {
+        if (size >= least) return 1.0f;
+        const float draw = float(scrambled(seed + uint32_t(sample)) >> 8) * (1.0f / 16777216.0f);
+        return draw * least < size ? least / size : 0.0f;
+    }
+};
+
+inline float gradient_size(const SampleGradients& d, int s) {
+    const float* colour = d.colour.data() + s / kLanes * 3 * kLanes + s % kLanes;
+    return std::max(std::max(std::fabs(d.raw[std::size_t(s)]), std::fabs(colour[0])), std::max(std::fabs(colour[kLanes]), std::fabs(colour[2 * kLanes])));
+}
+
+// Takes out of the chunk, in place, what lies behind the end of its ray and what the roulette leaves out: more than half of the
+// samples. Of a chunk's rays half of the samples have a fiftieth of the gradient.
+inline void drop_unused(Chunk& c, SampleGradients& d, float negligible, uint32_t seed) {
+    Roulette roulette;
+    roulette.seed = seed;
+    if (negligible > 0) {
+        double sizes = 0;
+        for (const Segment& segment : c.segments)
+            for (int s = segment.start; s < segment.start + segment.count; ++s) sizes += gradient_size(d, s);
+        roulette.least = negligible * float(sizes / std::max(c.used, 1));
+    }
     const int rows = encoded_rows(c.f), before = c.samples;
     int to = 0;
-    const auto move = [&](int s, bool counts) {
+    const auto move = [&](int s, float factor) {
         const auto at = [](int sample, int of, int row) { return (std::size_t(sample / kLanes * of) + std::size_t(row)) * kLanes + std::size_t(sample % kLanes); };
         for (int i = 0; i < rows && s != to; ++i) c.encoded[at(to, rows, i)] = c.encoded[at(s, rows, i)];
         for (int k = 0; k < 3; ++k) {
             c.position[at(to, 3, k)] = c.position[at(s, 3, k)];
             c.colour[at(to, 3, k)] = c.colour[at(s, 3, k)];
-            d.colour[at(to, 3, k)] = counts ? d.colour[at(s, 3, k)] : 0.0f;
+            d.colour[at(to, 3, k)] = factor * d.colour[at(s, 3, k)];
         }
-        d.raw[std::size_t(to)] = counts ? d.raw[std::size_t(s)] : 0.0f;
+        d.raw[std::size_t(to)] = factor * d.raw[std::size_t(s)];
         c.ray[to++] = c.ray[s];
     };
     for (const Segment& segment : c.segments)
-        for (int s = segment.start; s < segment.start + segment.count; ++s) move(s, true);
-    for (const int last = to - 1; to % (2 * kLanes) && to < before;) move(last, false);  // whole pairs of packets
+        for (int s = segment.start; s < segment.start + segment.count; ++s) {
+            const float factor = roulette.least > 0 ? roulette.factor(gradient_size(d, s), s) : 1.0f;
+            if (factor != 0.0f) move(s, factor);
+        }
+    if (to == 0 && before) move(0, 0.0f);
+    for (const int last = to - 1; to % (2 * kLanes) && to < before;) {  // whole pairs of packets
+        move(last, 1.0f);
+        d.raw[std::size_t(to - 1)] = 0;
+        for (int k = 0; k < 3; ++k) d.colour[std::size_t(((to - 1) / kLanes * 3 + k) * kLanes + (to - 1) % kLanes)] = 0;
+    }
     c.samples = to;
 }
 
@@ -115,7 +157,7 @@ inline void network_adjoint(Chunk& c, const SampleGradients& d, float* sums, flo
     const int64_t es = int64_t(encoded_rows(f)) * kLanes;
     for (int s = 0; s < c.samples; s += nerfvol::kFieldBlock) {
         const int packets = std::min(kBlockPackets, (c.samples - s) / kLanes);
-        c.run_block(s, packets);
+        c.run_block(s, packets, f.n_layers - 2);  // what the last layer made is not asked for
         for (int p = 0; p < packets; ++p) {
             const int at = s + p * kLanes;
             const float* colour = d.colour.data() + 3 * at;
@@ -138,7 +180,7 @@ inline void network_adjoint(Chunk& c, const SampleGradients& d, float* sums, flo
         layers.back(e, packets, sums, d.raw.data() + s);
         const std::size_t row = std::size_t(f.features * kLanes);
         for (int p = 0; p < packets && encoding; ++p)
-            for (int level = 0; level < f.levels; ++level)
+            for (int level = 0; level < f.active; ++level)
                 std::memcpy(encoding + (std::size_t(level) * std::size_t(c.samples / kLanes) + std::size_t(s / kLanes + p)) * row,
                             layers.g[0].data() + p * es + int64_t(level) * int64_t(row), row * sizeof(float));
     }

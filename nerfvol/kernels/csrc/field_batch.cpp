@@ -59,19 +59,26 @@ void draw_pixels(const FieldPixels& from, uint64_t key, int64_t n, float* origin
     constexpr int64_t kChunk = 256;
     const uint64_t pixels = uint64_t(from.starts[from.views]);
     parallel_for(int((n + kChunk - 1) / kChunk), [&](int chunk, int) {
-        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
-            const uint64_t h = mixed(key + uint64_t(i) * 0x9E3779B97F4A7C15ull);
+        struct Place { uint64_t drawn; int64_t view; const float* direction; const uint8_t* colour; } places[kChunk];
+        const int64_t first = chunk * kChunk, count = std::min(n - first, kChunk);
+        for (int64_t k = 0; k < count; ++k) {  // all are asked for before the first is waited for: pictures do not fit into a cache
+            const uint64_t h = mixed(key + uint64_t(first + k) * 0x9E3779B97F4A7C15ull);
             const int64_t pixel = int64_t((h >> 32) * pixels >> 32);
             const int64_t view = std::upper_bound(from.starts, from.starts + from.views + 1, pixel) - from.starts - 1;
-            const float* d = from.directions[view] + 3 * (pixel - from.starts[view]);
-            const uint8_t* c = from.colours[view] + 3 * (pixel - from.starts[view]);
-            const float* r = from.rotations + 9 * view;
+            const int64_t at = 3 * (pixel - from.starts[view]);
+            places[k] = {h, view, from.directions[view] + at, from.colours[view] + at};
+            __builtin_prefetch(places[k].direction);
+            __builtin_prefetch(places[k].colour);
+        }
+        for (int64_t k = 0, i = first; k < count; ++k, ++i) {
+            const Place& a = places[k];
+            const float *d = a.direction, *r = from.rotations + 9 * a.view;
             for (int axis = 0; axis < 3; ++axis) {
-                origins[3 * i + axis] = from.origins[3 * view + axis];
+                origins[3 * i + axis] = from.origins[3 * a.view + axis];
                 directions[3 * i + axis] = r[3 * axis] * d[0] + r[3 * axis + 1] * d[1] + r[3 * axis + 2] * d[2];
-                target[3 * i + axis] = float(c[axis]) * (1.0f / 255.0f);
+                target[3 * i + axis] = float(a.colour[axis]) * (1.0f / 255.0f);
             }
-            jitter[i] = float(mixed(h) >> 40) * (1.0f / 16777216.0f);
+            jitter[i] = float(mixed(a.drawn) >> 40) * (1.0f / 16777216.0f);
         }
     });
 }

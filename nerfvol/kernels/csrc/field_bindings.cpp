@@ -39,7 +39,7 @@ void set_grid(FieldShape& f, const std::vector<int>& resolutions, const std::vec
     require(features == 1 || features == 2 || features == 4 || features == 8, "an entry has 1, 2, 4 or 8 features");
     require(bricks > 0 && (bricks & (bricks - 1)) == 0 && bricks <= int64_t(1) << 26, "the bricks of a level must be a power of two");
     f.hashed = true;
-    f.levels = int(resolutions.size());
+    f.levels = f.active = int(resolutions.size());
     f.features = features;
     f.dense = dense;
     f.bricks = uint32_t(bricks);
@@ -57,7 +57,7 @@ void set_frequencies(FieldShape& f, int n) {
     require(n >= 0 && n <= 16, "there are 0 to 16 frequencies");
     f.hashed = false;
     f.frequencies = n;
-    f.levels = 0;
+    f.levels = f.active = 0;
     f.encoded = 3 + 6 * n;
 }
 
@@ -222,6 +222,7 @@ void py_refresh(In<float, nb::ndim<1>> sigmas, In<float, nb::ndim<1>> thresholds
 void bind_fields(nb::module_& m) {
     nb::class_<FieldShape>(m, "FieldShape").def(nb::init<>())
         .def("grid", &set_grid, "resolutions"_a, "starts"_a, "features"_a, "dense"_a, "bricks"_a)
+        .def("use_levels", [](FieldShape& f, int n) { require(n >= 0 && n <= f.levels, "more levels than the grid has"); f.active = n; }, "n"_a)
         .def("frequencies", &set_frequencies, "n"_a)
         .def("network", &set_network, "layers"_a, "head"_a, "sh_head"_a, "sh_degree"_a, "frequencies_dir"_a)
         .def("domain", &set_domain, "center"_a, "half"_a, "outer"_a, "density_scale"_a, "density_bias"_a, "softplus"_a);
@@ -230,7 +231,7 @@ void bind_fields(nb::module_& m) {
         .def_prop_rw("background", [](const FieldLoss& l) { return std::vector<float>(l.background, l.background + 3); },
                      [](FieldLoss& l, const std::vector<float>& v) { for (std::size_t k = 0; k < 3; ++k) l.background[k] = v.at(k); })
         .def_rw("colour", &FieldLoss::colour).def_rw("distortion", &FieldLoss::distortion).def_rw("entropy", &FieldLoss::entropy)
-        .def_rw("early_stop_eps", &FieldLoss::early_stop_eps);
+        .def_rw("early_stop_eps", &FieldLoss::early_stop_eps).def_rw("negligible", &FieldLoss::negligible);
     nb::class_<FieldRates>(m, "FieldRates").def(nb::init<>())
         .def_rw("rate", &FieldRates::rate).def_rw("beta1", &FieldRates::beta1).def_rw("beta2", &FieldRates::beta2).def_rw("eps", &FieldRates::eps)
         .def_rw("table_decay", &FieldRates::table_decay).def_rw("network_decay", &FieldRates::network_decay);

@@ -201,17 +201,17 @@ private:
         }
         for (int s = base; s < samples; s += nerfvol::kFieldBlock) {
             const int packets = std::min(kBlockPackets, (samples - s) / kLanes);
-            run_block(s, packets);
+            run_block(s, packets, f.n_layers - 1);
             for (int p = 0; p < packets; ++p) heads(s + p * kLanes, p);
         }
     }
 
 public:
-    // The network for a block of samples; its outputs stay in `layers`.
-    void run_block(int s, int packets) {
+    // The network for a block of samples up to layer `last`; its outputs stay in `layers`.
+    void run_block(int s, int packets, int last) {
         const int rows = direction_rows();
         for (int p = 0; p < packets; ++p) directions(s + p * kLanes, rows, directions_.data() + p * rows * kLanes);
-        layers.run(encoded + int64_t(s / kLanes) * encoded_rows(f) * kLanes, directions_.data(), packets, f.n_layers - 1, 0);
+        layers.run(encoded + int64_t(s / kLanes) * encoded_rows(f) * kLanes, directions_.data(), packets, last, 0);
     }
     const float* block_directions(int p) const { return directions_.data() + p * direction_rows() * kLanes; }
 

@@ -61,9 +61,11 @@ inline void encode(const FieldShape& f, const float* table, const float* p, floa
     if (!f.hashed) return encode_frequencies(f.frequencies, p, out);
     with_features(f.features, [&](auto features) {
         Corners corners[2];  // the next level's are found, and asked for, before this one's are read
-        find_corners(f, 0, p, corners[0]);
-        for (int level = 0; level < f.levels; ++level) {
-            if (level + 1 < f.levels) {
+        const int row = features * kLanes;
+        if (f.active < f.levels) std::fill(out + f.active * row, out + f.levels * row, 0.0f);
+        if (f.active) find_corners(f, 0, p, corners[0]);
+        for (int level = 0; level < f.active; ++level) {
+            if (level + 1 < f.active) {
                 find_corners(f, level + 1, p, corners[(level + 1) % 2]);
                 prefetch<features>(corners[(level + 1) % 2], table + f.start[level + 1] * features);
             }

@@ -12,6 +12,7 @@ namespace NERFVOL_ISA {
 struct Corners {
     alignas(64) int32_t entry[8][kLanes];
     alignas(64) float face[4][kLanes], low[kLanes], high[kLanes];  // weights in x and y; in z
+    bool adjacent;                                             // entries o and o + 1, neighbours in z, lie next to each other
 };
 
 // The cells of one axis: lower vertex and the distance from it.
@@ -43,6 +44,7 @@ inline void find_corners(const FieldShape& f, int level, const float* p, Corners
         c.face[2][k] = hx[k] * (1.0f - hy[k]);
         c.face[3][k] = hx[k] * hy[k];
     }
+    c.adjacent = level < f.dense;
     if (level < f.dense) {
         const int row = n + 1, plane = row * row;
         for (int o = 0; o < 8; ++o) {
@@ -51,15 +53,19 @@ inline void find_corners(const FieldShape& f, int level, const float* p, Corners
         }
         return;
     }
-    const uint32_t mask = f.bricks - 1;
-    for (int o = 0; o < 8; ++o) {
-        const uint32_t a = uint32_t(o >> 2), b = uint32_t(o >> 1 & 1), d = uint32_t(o & 1);
+    // The numbers of brick and of entry within it side by side: their bits do not meet, so that they are hashed as one.
+    alignas(64) uint32_t part[3][2][kLanes];
+    for (uint32_t o = 0; o < 2; ++o)
         for (int k = 0; k < kLanes; ++k) {
-            const uint32_t i = uint32_t(x[k]) + a, j = uint32_t(y[k]) + b, l = uint32_t(z[k]) + d;
-            const uint32_t brick = ((i >> 1) ^ (j >> 1) * 2654435761u ^ (l >> 2) * 805459861u) & mask;  // primes of Teschner et al. 2003
-            c.entry[o][k] = int32_t(brick * 16u + (i & 1u) * 8u + (j & 1u) * 4u + (l & 3u));
+            const uint32_t i = uint32_t(x[k]) + o, j = uint32_t(y[k]) + o, l = uint32_t(z[k]) + o;
+            part[0][o][k] = (i >> 1) * 16u + (i & 1u) * 8u;
+            part[1][o][k] = (j >> 1) * 2654435761u * 16u + (j & 1u) * 4u;  // primes of Teschner et al. 2003
+            part[2][o][k] = (l >> 2) * 805459861u * 16u + (l & 3u);
         }
-    }
+    const uint32_t mask = f.bricks * 16u - 1u;
+    for (int o = 0; o < 8; ++o)
+        for (int k = 0; k < kLanes; ++k)
+            c.entry[o][k] = int32_t((part[0][o >> 2][k] ^ part[1][o >> 1 & 1][k] ^ part[2][o & 1][k]) & mask);
 }
 
 typedef float f2 __attribute__((vector_size(8)));
@@ -70,25 +76,38 @@ template <int F> inline void prefetch(const Corners& c, const float* entries) {
         for (int k = 0; k < kLanes; ++k) __builtin_prefetch(entries + F * int64_t(c.entry[r][k]), 1);
 }
 
+// Two features of a packet, four lanes at a time. Adjacent: a corner's neighbour in z is the next entry.
+template <bool Adjacent> inline void interpolate_pairs(const Corners& c, const float* entries, float* out) {
+    for (int k = 0; k < kLanes; k += 4) {
+        f4 sum[4];  // of a lane: both features at the lower z, both at the upper
+        for (int lane = 0; lane < 4; ++lane) {
+            sum[lane] = f4{};
+            for (int r = 0; r < 4; ++r) {
+                const float* lower = entries + 2 * int64_t(c.entry[2 * r][k + lane]);
+                f4 both;
+                if constexpr (Adjacent) both = load<f4>(lower);
+                else both = __builtin_shufflevector(load<f2>(lower), load<f2>(entries + 2 * int64_t(c.entry[2 * r + 1][k + lane])), 0, 1, 2, 3);
+                sum[lane] += both * splat4(c.face[r][k + lane]);
+            }
+        }
+        const f4 low = load<f4>(c.low + k), high = load<f4>(c.high + k);
+        const f4 l0 = __builtin_shufflevector(sum[0], sum[1], 0, 4, 1, 5), l1 = __builtin_shufflevector(sum[2], sum[3], 0, 4, 1, 5);
+        const f4 h0 = __builtin_shufflevector(sum[0], sum[1], 2, 6, 3, 7), h1 = __builtin_shufflevector(sum[2], sum[3], 2, 6, 3, 7);
+        store(out + k, __builtin_shufflevector(l0, l1, 0, 1, 4, 5) * low + __builtin_shufflevector(h0, h1, 0, 1, 4, 5) * high);
+        store(out + kLanes + k, __builtin_shufflevector(l0, l1, 2, 3, 6, 7) * low + __builtin_shufflevector(h0, h1, 2, 3, 6, 7) * high);
+    }
+}
+
 // F rows of a packet's encoding from a level's entries.
 template <int F> inline void interpolate(const Corners& c, const float* entries, float* out) {
+    if constexpr (F == 2) return c.adjacent ? interpolate_pairs<true>(c, entries, out) : interpolate_pairs<false>(c, entries, out);
     for (int k = 0; k < kLanes; ++k) {
-        if constexpr (F == 2) {
-            f4 sum{};
-            for (int r = 0; r < 4; ++r) {
-                const f2 a = load<f2>(entries + 2 * int64_t(c.entry[2 * r][k])), b = load<f2>(entries + 2 * int64_t(c.entry[2 * r + 1][k]));
-                sum += __builtin_shufflevector(a, b, 0, 1, 2, 3) * splat4(c.face[r][k]);
-            }
-            out[k] = sum[0] * c.low[k] + sum[2] * c.high[k];
-            out[kLanes + k] = sum[1] * c.low[k] + sum[3] * c.high[k];
-        } else {
-            float sum[F] = {};
-            for (int o = 0; o < 8; ++o) {
-                const float w = c.face[o >> 1][k] * (o & 1 ? c.high[k] : c.low[k]);
-                for (int i = 0; i < F; ++i) sum[i] += w * entries[F * int64_t(c.entry[o][k]) + i];
-            }
-            for (int i = 0; i < F; ++i) out[i * kLanes + k] = sum[i];
+        float sum[F] = {};
+        for (int o = 0; o < 8; ++o) {
+            const float w = c.face[o >> 1][k] * (o & 1 ? c.high[k] : c.low[k]);
+            for (int i = 0; i < F; ++i) sum[i] += w * entries[F * int64_t(c.entry[o][k]) + i];
         }
+        for (int i = 0; i < F; ++i) out[i * kLanes + k] = sum[i];
     }
 }
 
@@ -100,6 +119,14 @@ template <int F> inline void scatter(const Corners& c, const float* d, float* gr
             const float a = d[k], b = d[kLanes + k];
             if (a == 0.0f && b == 0.0f) continue;
             const f2 both = {a, b}, low = both * c.low[k], high = both * c.high[k];
+            if (whole && c.adjacent) {
+                const f4 all = __builtin_shufflevector(low, high, 0, 1, 2, 3);
+                for (int r = 0; r < 4; ++r) {
+                    float* to = gradient + 2 * int64_t(c.entry[2 * r][k]);
+                    store(to, load<f4>(to) + all * splat4(c.face[r][k]));
+                }
+                continue;
+            }
             for (int r = 0; r < 4; ++r) {
                 const float w = c.face[r][k];
                 const int64_t i = c.entry[2 * r][k], j = c.entry[2 * r + 1][k];

@@ -69,7 +69,7 @@ struct Layers {
             const float* from = in + first_row(f, l) * kLanes;
             if (a.relu) product<true>(m, wanted, from, xs, y, ys, packets);
             else product<false>(m, wanted, from, xs, y, ys, packets);
-            if (l < last && f.layers[l + 1].extra != nerfvol::kNothing) {
+            if (l + 1 < f.n_layers && f.layers[l + 1].extra != nerfvol::kNothing) {
                 const bool again = f.layers[l + 1].extra == nerfvol::kPosition;
                 const int rows = again ? f.encoded : f.encoded_dir;
                 const float* more = again ? e : dirs;

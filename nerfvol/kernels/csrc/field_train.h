@@ -124,7 +124,9 @@ private:
         losses_[number] = adjoint(chunk, rays, from, loss, gradients);
         counts_[2 * number] = chunk.samples;
         counts_[2 * number + 1] = chunk.used;
-        drop_unused(chunk, gradients);
+        uint32_t seed = uint32_t(from);
+        if (rays.jitter) std::memcpy(&seed, rays.jitter + from, 4);  // another one in each step
+        drop_unused(chunk, gradients, loss.negligible, scrambled(seed));
         float* encoding = nullptr;
         if (f.hashed) encoding = static_cast<float*>(arena.take(std::size_t(chunk.samples) * std::size_t(f.encoded) * sizeof(float)));
         network_adjoint(chunk, gradients, sums, encoding);
@@ -133,12 +135,12 @@ private:
 
     void second_pass() {
         // With more threads than levels each level is cut, at bricks; finest levels, which take longest, go first.
-        const int slices = f.hashed ? std::max(1, (nerfvol::get_threads() + f.levels - 1) / f.levels) : 0;
-        for (int l = 0; l < f.levels && memory.moves; ++l) memory.updates[l] += memory.moves[l] ? 1 : 0;
+        const int slices = f.active ? (nerfvol::get_threads() + f.active - 1) / f.active : 0;
+        for (int l = 0; l < f.active && memory.moves; ++l) memory.updates[l] += memory.moves[l] ? 1 : 0;
         if (memory.moves) ++memory.updates[f.levels];
-        nerfvol::parallel_for(f.levels * slices + 1, [&](int task, int) {
-            if (task == f.levels * slices) return move_network();
-            const int level = f.levels - 1 - task / slices, slice = task % slices;
+        nerfvol::parallel_for(f.active * slices + 1, [&](int task, int) {
+            if (task == f.active * slices) return move_network();
+            const int level = f.active - 1 - task / slices, slice = task % slices;
             const int64_t entries = f.start[level + 1] - f.start[level], bricks = (entries + nerfvol::kFieldBrick - 1) / nerfvol::kFieldBrick;
             const int64_t from = bricks * slice / slices * nerfvol::kFieldBrick, to = std::min(entries, bricks * (slice + 1) / slices * nerfvol::kFieldBrick);
             const int64_t first = f.start[level] * f.features;
