@@ -5,7 +5,9 @@
 Documents are changed value by value (another type, huge, negative, empty, nested, gone), binary files byte by byte and cut.
 What readers raise besides InputError is a find, and so is what ends the interpreter, takes longer than ten seconds or, at any
 moment, 2 GB: it is printed with the kind and the number that make it again (SEED KIND NUMBER), and its file is kept in --keep.
-All kinds get the same time, so that the quick ones are tried more often. The exit code is 1 where there are finds.
+All kinds get the same time, so that the quick ones are tried more often. The exit code is 1 where there are finds. --counts
+says how often each kind was tried. Files lie in memory (/dev/shm) where the system has such a place: a disk's would cost most
+of the time.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -36,6 +38,9 @@ from nerfvol.errors import InputError
 from nerfvol.machine import peak_memory
 
 SECONDS_EACH, BYTES, ADDRESSES = 10, 2 << 30, 6 << 30
+NOTE = 200
+"""Letters of the note on what is tried."""
+IN_MEMORY = "/dev/shm"
 
 
 class TooLong(Exception):
@@ -65,10 +70,13 @@ class Tries:
         self.refused = 0
         self.finds: dict[str, str] = {}
 
-    def one(self, name: str, change: Callable[[random.Random], None], read: Callable[[], object], note: Path) -> None:
-        """Damages a file and reads it."""
+    def one(
+        self, name: str, change: Callable[[random.Random], None], read: Callable[[], object], note: BinaryIO
+    ) -> None:
+        """Damages a file and reads it; ``note``: an open file that keeps what is tried."""
         key, began = f"{self.seed} {name} {self.count[name]}", time.monotonic()
-        note.write_text(key)
+        note.seek(0)
+        note.write(key.ljust(NOTE).encode())
         try:
             change(random.Random(key))
             with bounded(), np.errstate(all="ignore"):
@@ -103,9 +111,10 @@ def work(folder: Path, tries: Tries, seconds: float, only: str | None) -> None:
     """Tries until the time is over."""
     known = {name: (change, read) for name, change, read in targets(folder) if only in (None, name)}
     until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        name = min(known, key=lambda name: tries.seconds[name])
-        tries.one(name, *known[name], folder / "trying")
+    with (folder / "trying").open("wb", buffering=0) as note:
+        while time.monotonic() < until:
+            name = min(known, key=lambda name: tries.seconds[name])
+            tries.one(name, *known[name], note)
 
 
 def main() -> int:
@@ -113,24 +122,26 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", help="one kind")
+    parser.add_argument("--counts", action="store_true", help="say how often each kind was tried")
     parser.add_argument("--keep", type=Path, default=Path("build/fuzz"))
     given = parser.parse_args()
     with contextlib.suppress(ImportError):
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    with tempfile.TemporaryDirectory() as temporary:
+    home = IN_MEMORY if os.access(IN_MEMORY, os.W_OK) else None
+    with tempfile.TemporaryDirectory(dir=home) as temporary:
         tries = Tries([name for name, *_ in targets(Path(temporary))], given.seed)
     began = time.monotonic()
     while (left := given.seconds - (time.monotonic() - began)) > 0:
-        with tempfile.TemporaryDirectory() as temporary:
+        with tempfile.TemporaryDirectory(dir=home) as temporary:
             folder = Path(temporary)
             part = functools.partial(work, folder, tries, left, given.only)
             result = _in_a_process_of_its_own(part, tries)
             if isinstance(result, Tries):
                 tries = result
             else:
-                key = (folder / "trying").read_text()
+                key = (folder / "trying").read_text().rstrip()
                 name = key.split(" ", 1)[1].rsplit(" ", 1)[0]
                 tries.find(f"{name}: the interpreter ended with {result}", key)
                 tries.count[name] = int(key.rsplit(" ", 1)[1]) + 1
@@ -141,6 +152,8 @@ def main() -> int:
     n = sum(tries.count.values())
     print(f"{n} files of {len(tries.names)} kinds in {time.monotonic() - began:.0f} s: {tries.refused} refused, "
           f"{len(tries.finds)} kinds of finds")  # fmt: skip
+    if given.counts:
+        print("\n".join(f"{count:8} {name}" for name, count in tries.count.items()))
     return 1 if tries.finds else 0
 
 

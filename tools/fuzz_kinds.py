@@ -140,7 +140,7 @@ def targets(folder: Path) -> list[tuple[str, Callable[[random.Random], None], Ca
             write(home, scenes.ring(), scenes.random_images())
             path = home / file
             change = of_json(path) if path.suffix == ".json" else of_bytes(path)
-            add(f"{name} {file}", change, lambda home=home: load_dataset(home).points)
+            add(f"{name} {file}", change, lambda home=home: load_dataset(home, threads=1).points)
 
     sets("nerfstudio", scenes.write_nerfstudio, "transforms.json")
     sets("ngp", scenes.write_instant_ngp, "transforms.json", "images/view_003.png")

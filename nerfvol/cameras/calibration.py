@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Intrinsics
+from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import PINHOLE, BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError, shown
 
@@ -125,7 +126,7 @@ def _focal(angle: float | None, size: int) -> float | None:
 
 CALIBRATION_KEYS = {
     "camera_model", "is_fisheye", "ftheta_p0", "latlong", "equirectangular", "w", "h", "fl_x", "fl_y", "cx", "cy", "x_fov",
-    "y_fov", "camera_angle_x", "camera_angle_y", *BrownConrady.names(), *Fisheye.names(),
+    "y_fov", "camera_angle_x", "camera_angle_y", *Rational.names(), *Fisheye.names(), *FieldOfView.names(),
 }  # fmt: skip
 """What :func:`read_calibration` looks at."""
 CAMERA_MODELS: dict[str, type[Lens]] = {
@@ -135,12 +136,13 @@ CAMERA_MODELS: dict[str, type[Lens]] = {
     "SIMPLE_RADIAL": BrownConrady,
     "RADIAL": BrownConrady,
     "PERSPECTIVE": BrownConrady,
-    "FULL_OPENCV": BrownConrady,
+    "FULL_OPENCV": Rational,
     "OPENCV_FISHEYE": Fisheye,
     "SIMPLE_RADIAL_FISHEYE": Fisheye,
     "RADIAL_FISHEYE": Fisheye,
     "SIMPLE_FISHEYE": Fisheye,
     "FISHEYE": Fisheye,
+    "FOV": FieldOfView,
 }
 """The lens that a JSON file's ``camera_model`` names; of several names a lens is written with its first."""
 _DEFAULT_MODEL = "OPENCV"
@@ -183,17 +185,18 @@ def read_calibration(data: Mapping[str, Any]) -> Calibration:
     Raises:
         InputError: a value that is no number, an unknown or unsupported camera_model.
     """
-    model = data.get("camera_model", _DEFAULT_MODEL)
-    model = model.upper() if isinstance(model, str) else model
+    model = data.get("camera_model") or _DEFAULT_MODEL
+    model = model.strip().upper() if isinstance(model, str) else model
     if not isinstance(model, str) or model not in CAMERA_MODELS:
         raise InputError(f"camera_model {shown(model):.60} is not supported; known models: {', '.join(CAMERA_MODELS)}")
     unsupported = [key for key in ("ftheta_p0", "latlong", "equirectangular") if data.get(key)]
     if unsupported:
         raise InputError(f"lens model {unsupported[0]} is not supported: expected a pinhole or OpenCV fisheye camera")
-    lens = Fisheye if data.get("is_fisheye") is True else CAMERA_MODELS[model]
-    if model == "FULL_OPENCV" and any(finite_number(data, key) for key in ("k4", "k5", "k6")):
-        raise InputError("the rational terms k4, k5, k6 of FULL_OPENCV are not supported; export undistorted images")
-    # What other lenses have is not read: exporters write zeros or leftovers of p1, p2 next to a fisheye lens.
+    lens = Fisheye if is_true(data.get("is_fisheye")) else CAMERA_MODELS[model]
+    if lens is BrownConrady and any(finite_number(data, key) for key in ("k5", "k6")):
+        lens = Rational  # OpenCV's eight coefficients: there is no other model with six k
+    if lens is Rational and not any(finite_number(data, key) for key in ("k4", "k5", "k6")):
+        lens = BrownConrady
     coefficients = {name: finite_number(data, name) or 0.0 for name in lens.names()}
     degrees = {key: finite_number(data, key) for key in ("x_fov", "y_fov")}
     angles = [None if v is None else math.radians(v) for v in degrees.values()]
@@ -209,6 +212,52 @@ def read_calibration(data: Mapping[str, Any]) -> Calibration:
         cy=finite_number(data, "cy"),
         lens=lens(**coefficients),
     )
+
+
+def is_true(value: Any) -> bool:
+    """Whether a JSON value says yes: true, 1, or one of both in quotes."""
+    return (
+        value is True
+        or (type(value) in (int, float) and value == 1)
+        or str(value).strip().lower() in ("true", "1", "yes")
+    )
+
+
+_COEFFICIENTS = {
+    "PINHOLE": (), "SIMPLE_PINHOLE": (), "PERSPECTIVE": (), "SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2"),
+    "SIMPLE_FISHEYE": (), "FISHEYE": (), "SIMPLE_RADIAL_FISHEYE": ("k1",), "RADIAL_FISHEYE": ("k1", "k2"),
+}  # fmt: skip
+"""What a model of that name has, by COLMAP; where it has less than its lens here."""
+
+
+def calibration_doubts(data: Mapping[str, Any]) -> list[str]:
+    """Words on what the keys state and :func:`read_calibration` does not use, or uses although they contradict each other.
+
+    ``data``: keys that it has read without an error.
+    """
+    lens, model = read_calibration(data).lens, str(data.get("camera_model") or _DEFAULT_MODEL).strip().upper()
+    stated = [key for key in sorted(_ALL_COEFFICIENTS) if finite_number(data, key)]
+    said = []
+    if unused := [key for key in stated if key not in lens.names()]:
+        said.append(f"{', '.join(unused)} (a {lens.KIND} lens has no such coefficient, and they are not used)")
+    beyond = [key for key in stated if key in lens.names() and key not in _COEFFICIENTS.get(model, lens.names())]
+    if beyond and type(lens) is CAMERA_MODELS[model]:
+        said.append(f"camera_model {model} and {', '.join(beyond)}, which it has not (they are used)")
+    for focal, size, *others in (("fl_x", "w", "camera_angle_x", "x_fov"), ("fl_y", "h", "camera_angle_y", "y_fov")):
+        pixels, side = finite_number(data, focal), finite_number(data, size)
+        for key in others:
+            angle = finite_number(data, key)
+            if pixels and side and angle and not isinstance(lens, Fisheye):
+                stated_angle = math.radians(angle) if key.endswith("fov") else angle
+                other = 2 * math.atan(0.5 * side / pixels)
+                if abs(stated_angle - other) > 0.02 * other:
+                    unit = "degrees" if key.endswith("fov") else "radians"
+                    value = math.degrees(other) if key.endswith("fov") else other
+                    said.append(f"{key} {angle:.4g} where {focal} and {size} mean {value:.4g} {unit} ({focal} counts)")
+    return said
+
+
+_ALL_COEFFICIENTS = {*Rational.names(), *Fisheye.names(), *FieldOfView.names()}
 
 
 def lens_keys(lens: Lens) -> dict[str, Any]:

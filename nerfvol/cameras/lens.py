@@ -126,6 +126,10 @@ class BrownConrady(Lens):
     def _fold(self) -> float:
         return _fold(self._radial)
 
+    def _factor(self, s: Float) -> tuple[Float, Float]:
+        """The radial factor and its derivative by s, (n,) each."""
+        return _polynomial(s, self._radial)
+
     def distort(self, points: Float) -> Float:
         """As for :class:`Lens`: points with Z <= 0 are not seen."""
         z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
@@ -133,7 +137,7 @@ class BrownConrady(Lens):
         x, y = plane[:, 0], plane[:, 1]
         p1, p2 = self.p1, self.p2
         s = x * x + y * y
-        radial = _polynomial(s, self._radial)[0]
+        radial = self._factor(s)[0]
         return np.stack(
             [x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y],
             axis=1,
@@ -151,7 +155,7 @@ class BrownConrady(Lens):
         found = np.zeros(len(plane), dtype=bool)
         for _ in range(_MAX_STEPS):
             s = x * x + y * y
-            radial, slope = _polynomial(s, self._radial)
+            radial, slope = self._factor(s)
             ex = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x) - plane[:, 0]
             ey = y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y - plane[:, 1]
             jxx = radial + 2 * slope * x * x + 2 * p1 * y + 6 * p2 * x

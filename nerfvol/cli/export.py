@@ -15,7 +15,9 @@ from nerfvol.config.values import Count, box, byte_count, fraction
 from nerfvol.export import EXPORTS, choose, export_model
 
 if TYPE_CHECKING:
+    from nerfvol.export.part import Up
     from nerfvol.export.surface import Cameras
+    from nerfvol.models import Model
 
 
 @dataclass
@@ -106,13 +108,29 @@ def run(options: ExportOptions) -> int:
     seconds = time.perf_counter() - started
     at = f" at level {written.level}" if row.levels and written.level is not None else ""
     print(f"{options.out}: {row.name}{at}, {written.size / 1e6:.1f} MB in {seconds:.1f} s; opened by {row.opened_by}")
-    if row.name == "splats" and target.model.kind == "splats":
-        from nerfvol.splats.ply import lost_digits
-        from nerfvol.views import SplatModel
-
-        if isinstance(target.model, SplatModel) and (said := lost_digits(target.model.splats)) is not None:
-            print(f"warning: {said}")
+    if row.name in ("splats", "spz") and (said := _relative(target.model, options.up or "none")) is not None:
+        print(said)
     return 0
+
+
+def _relative(model: Model, up: Up) -> str | None:
+    """A sentence where a format of float32 positions has them relative to a point near them; None: as they are."""
+    import numpy as np
+
+    from nerfvol.export.splats import splats_of
+    from nerfvol.splats.near import relative
+
+    low, high = model.aabb()
+    if float(np.spacing(np.float32(np.abs([low, high]).max()))) < 1e-7 * float((high - low).max()):
+        return None  # far from where digits are lost
+    offset = relative(splats_of(model, up))[1]
+    if not offset.any():
+        return None
+    told = ", ".join(f"{v:.12g}" for v in offset)
+    return (
+        f"positions are written relative to ({told}): the format's float32 would not tell them apart there; add it to have "
+        "the units of the poses"
+    )
 
 
 def _cameras(target: Target, name: str | None) -> Cameras | None:

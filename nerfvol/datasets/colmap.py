@@ -25,9 +25,11 @@ from nerfvol.datasets.colmap_files import (
     read_images,
     read_points,
 )
-from nerfvol.datasets.listing import Frame, ImageFinder, Listing, MaskFinder, Poses, hold_out, is_photograph, named
+from nerfvol.datasets.listing import Frame, ImageFinder, Listing, Poses, is_photograph, named
 from nerfvol.datasets.llff import image_folder
+from nerfvol.datasets.masks import MaskFinder
 from nerfvol.datasets.points import ModelPoints
+from nerfvol.datasets.split_lists import split_frames
 from nerfvol.errors import InputError
 
 _PLACES = ("sparse", "colmap/sparse", "distorted/sparse", ".")
@@ -98,16 +100,18 @@ def read(folder: Path, split: str) -> Listing:
         messages.append(f"{model.relative_to(folder)} holds a model as text too, which is not read")
     photographs = _photographs(folder, source)
     finder, masks, poses = ImageFinder(photographs), MaskFinder(folder, photographs), Poses(source)
-    frames, numbers = [], []
+    frames, numbers, known = [], [], set()
     for number, name, quaternion, translation, camera in read_images(model):
-        if camera not in calibrations:
-            raise InputError(f"{source}, image {name}: its camera {camera} is not in the model's cameras")
+        path = finder.find(name)
+        known.add(path)
         try:
+            if camera not in calibrations:
+                raise InputError(f"its camera {camera} is not in the model's cameras")
             c2w = poses.read(name, _pose(quaternion, translation))
         except InputError as error:
-            raise InputError(f"{source}, image {name}: {error}") from None
+            poses.leave_out(InputError(f"{source}, image {name}: {error}"))
+            continue
         if c2w is not None:
-            path = finder.find(name)
             frames.append(Frame(name, path, c2w, calibrations[camera], masks.of(name, path)))
             numbers.append(number)
     messages += poses.messages()
@@ -122,10 +126,12 @@ def read(folder: Path, split: str) -> Listing:
     missing = [frame for frame in frames if frame.path is None]
     if not present:
         return Listing(frames, frames, source)
-    messages += masks.messages(present) + _in_no_model(photographs, frames)
-    chosen, training, sentence = hold_out(present, split)
+    messages += masks.messages(present) + _in_no_model(photographs, known)
+    chosen, training, said = split_frames(present, split, [folder, model, model.parent, photographs])
     path = points_file(model)
-    listing = Listing(chosen + missing, training, source, messages=[*messages, sentence])
+    if path is None and (model / "points3D.ply").is_file():
+        messages.append("points3D.ply is not read, and points3D.bin is not there: the model's points are not known")
+    listing = Listing(chosen + missing, training, source, messages=messages + said)
     if path is not None:
         listing.messages += _doubt(path, dict(zip(numbers, frames, strict=True)))
         listing.read_points = lambda: model_points(path)
@@ -136,14 +142,14 @@ def _photographs(folder: Path, source: Path) -> Path:
     """Where the photographs of the model of ``source`` lie: in ``folder`` or, where that is the model's own, above it."""
     name = next((record.name for record in read_images(source.parent)), "")
     homes = (folder, folder.parent, folder.parent.parent) if source.parent == folder else (folder,)
-    found = (image_folder(home) for home in homes)
+    found = [image_folder(home) for home in homes]
+    found += sorted(entry for home in homes[:1] for entry in home.iterdir() if entry.is_dir())  # whatever it is called
     return next((place for place in found if ImageFinder(place).find(name) is not None), image_folder(folder))
 
 
-def _in_no_model(photographs: Path, frames: Sequence[Frame]) -> list[str]:
-    """A sentence on photographs of the folder that the model does not have."""
-    known = {frame.path for frame in frames}
-    folders = {frame.path.parent for frame in frames if frame.path is not None} | {photographs}
+def _in_no_model(photographs: Path, known: set[Path | None]) -> list[str]:
+    """A sentence on photographs of the folder that the model, which names those ``known``, does not have."""
+    folders = {path.parent for path in known if path is not None} | {photographs}
     everything = {entry for folder in folders for entry in folder.iterdir() if is_photograph(entry) and entry.is_file()}
     left = sorted(entry.name for entry in everything - known)
     if not left:

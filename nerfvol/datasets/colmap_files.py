@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
+from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_bytes, read_text
@@ -27,7 +28,8 @@ _MODELS: dict[str, tuple[int, type[Lens], str]] = {
     "RADIAL": (3, BrownConrady, "f cx cy k1 k2"),
     "OPENCV": (4, BrownConrady, "fx fy cx cy k1 k2 p1 p2"),
     "OPENCV_FISHEYE": (5, Fisheye, "fx fy cx cy k1 k2 k3 k4"),
-    "FULL_OPENCV": (6, BrownConrady, "fx fy cx cy k1 k2 p1 p2 k3 k4* k5* k6*"),
+    "FULL_OPENCV": (6, Rational, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "FOV": (7, FieldOfView, "fx fy cx cy omega"),
     "SIMPLE_RADIAL_FISHEYE": (8, Fisheye, "f cx cy k1"),
     "RADIAL_FISHEYE": (9, Fisheye, "f cx cy k1 k2"),
     "THIN_PRISM_FISHEYE": (10, Fisheye, "fx fy cx cy k1 k2 p1* p2* k3 k4 sx1* sy1*"),
@@ -35,7 +37,7 @@ _MODELS: dict[str, tuple[int, type[Lens], str]] = {
     "FISHEYE": (15, Fisheye, "fx fy cx cy"),
 }
 _NAMES = {number: name for name, (number, *_) in _MODELS.items()}
-_UNREAD = {7: "FOV", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 16: "EUCM",
+_UNREAD = {11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 16: "EUCM",
            17: "EQUIRECTANGULAR"}  # fmt: skip
 """COLMAP's others, by name for the sentence that refuses them."""
 
@@ -106,6 +108,8 @@ def _calibration(model: str, width: int, height: int, parameters: tuple[float, .
     if not all(np.isfinite(parameters)) or min(width, height) < 1:
         raise InputError(f"a camera must have a size and finite parameters, got {width}x{height} and {parameters}")
     focal = values.get("f")
+    if lens is Rational and not any(values[name] for name in ("k4", "k5", "k6")):
+        lens = BrownConrady
     return Calibration(
         width=width,
         height=height,
@@ -166,8 +170,11 @@ def _cameras_text(path: Path) -> dict[int, Calibration]:
             continue
         try:
             camera, model, width, height, *parameters = line.split()
-            numbers = int(camera), int(width), int(height), tuple(map(float, parameters))
-        except ValueError:
+            model, sizes = model.upper(), (float(width), float(height))
+            numbers = int(camera), int(sizes[0]), int(sizes[1]), tuple(map(float, parameters))
+            if numbers[1:3] != sizes:
+                raise ValueError
+        except (ValueError, OverflowError):
             raise InputError(f"{path}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line!r:.60}") from None
         if model not in _MODELS or len(numbers[3]) != len(_MODELS[model][2].split()):
             raise InputError(f"{path}, camera {camera}: unknown lens model or wrong number of parameters: {line!r:.60}")

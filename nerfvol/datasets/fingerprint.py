@@ -14,10 +14,13 @@ from nerfvol.datasets.listing import named
 
 _ALIKE = 1e-5
 """Of the cameras' extent: poses that differ by less are the same, worked out on another machine."""
+_SAME_REGION = 0.01
+"""Of its side: a region that a plane sweep found on another machine differs by less."""
 
 
-def fingerprint(dataset: Dataset) -> dict[str, Any]:
-    """What a checkpoint keeps of a dataset: names, sizes (n, 2), poses (n, 3, 4) and check sums (n,) of pixels and masks."""
+def fingerprint(dataset: Dataset, lights: int | None = None) -> dict[str, Any]:
+    """What a checkpoint keeps of a dataset: names, sizes (n, 2), poses (n, 3, 4), check sums (n,) of pixels and masks; and
+    the region of detail (2, 3) and whether there is a background around it. ``lights``: of the file of lights, if any."""
 
     def content(i: int) -> int:
         mask = dataset.mask(i)
@@ -32,6 +35,10 @@ def fingerprint(dataset: Dataset) -> dict[str, Any]:
         "lenses": np.array([_lens(c.intrinsics) for c in dataset.cameras], np.int64),
         "poses": np.stack([camera.c2w[:3] for camera in dataset.cameras]),
         "content": np.array(map_threads(content, range(len(dataset)), dataset.threads), np.int64),
+        "region": dataset.scene.aabb,
+        "unbounded": dataset.scene.is_unbounded,
+        "lights": lights,
+        "lit": [camera.light for camera in dataset.cameras],
     }
 
 
@@ -75,4 +82,21 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
             said.append(f"{len(names)} have {what} ({named(names)})")
     if not said and [str(name) for name in before["names"]] != [str(name) for name in now["names"]]:
         said.append("they are in another order")
-    return f"of {n} pictures, " + ", ".join(said) if said else None
+    if said:
+        return f"of {n} pictures, " + ", ".join(said)
+    return _other_region(before, now) if "region" in before else None
+
+
+def _other_region(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
+    old, new = (np.asarray(record["region"], np.float64).reshape(2, 3) for record in (before, now))
+    if bool(before["unbounded"]) != bool(now["unbounded"]):
+        return "they are taken for another kind of scene"
+    if list(before["lit"]) != list(now["lit"]) or before["lights"] != now["lights"]:
+        return "the lights that they are taken under are others"
+    if np.abs(old - new).max() > _SAME_REGION * np.ptp(old, axis=0).max():
+        return f"the scene's aabb was {_shown(old)} and is {_shown(new)}"
+    return None
+
+
+def _shown(box: Any) -> str:
+    return ",".join(f"{v:.4g}" for v in box.ravel())

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera, Intrinsics
-from nerfvol.cameras.focus import crowd_of
 from nerfvol.cameras.lens import Fisheye
 from nerfvol.datasets.images import ImageHeader, UInt8, image_header, map_threads, read_mask
-from nerfvol.datasets.listing import Frame, named
+from nerfvol.datasets.listing import Frame, named, require_few, with_count
+from nerfvol.datasets.odd_ones import alone, astray
 from nerfvol.errors import InputError
 
-FEW = 0.1
-"""Share of the pictures that may be left out because they do not fit the others."""
 UNLIT = 32
 """Levels of 255: what is darker in all pictures, from some radius on, no lens has lit."""
 ENOUGH = 3
@@ -107,7 +105,9 @@ def views_of(
     require_few([*unread.values(), *wrong.values()], len(everything))
     if unread:
         messages.append(unread_sentence(list(unread.values())))
-    by_pose = _astray([made[id(f)] for f in training if id(f) in made], [made[id(f)] for f in frames if id(f) in made])
+    odd_ones = alone([made[key] for key in everything if key in made], messages)
+    made = {key: view for key, view in made.items() if id(view) not in odd_ones}
+    by_pose = astray([made[id(f)] for f in training if id(f) in made], [made[id(f)] for f in frames if id(f) in made])
     own = [frame for frame in frames if id(frame) in made and id(made[id(frame)]) not in by_pose]
     if not own:
         raise next(iter((unread | wrong).values()), InputError(f"{source}: no images are left for this split"))
@@ -117,16 +117,9 @@ def views_of(
     return views, kept or views
 
 
-def require_few(wrong: Sequence[InputError], n: int) -> None:
-    """The first of the errors, raised where so many of ``n`` pictures may not be left out: a tenth of ten and more."""
-    if wrong and (len(wrong) > max(1, FEW * n) or n < 10):
-        raise wrong[0]
-
-
 def unread_sentence(errors: Sequence[InputError]) -> str:
     """Of pictures that are left out because their files are damaged."""
-    rest = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return f"{len(errors)} images cannot be read and are left out: {errors[0]}{rest}"
+    return f"{len(errors)} images cannot be read and are left out: {with_count(errors)}"
 
 
 def _header(frame: Frame) -> ImageHeader | InputError:
@@ -206,19 +199,6 @@ def _odd_sizes(frames: dict[int, Frame], headers: dict[int, ImageHeader]) -> dic
     }
 
 
-def _astray(training: Sequence[View], views: Sequence[View]) -> set[int]:
-    """The views whose cameras lie far from all others, by id."""
-    if len(training) < 5:
-        return set()
-    crowd = crowd_of(np.stack([view.camera.position for view in training]))
-    found = set()
-    for group in (training, views):
-        positions = np.stack([view.camera.position for view in group]) if group else np.zeros((0, 3))
-        if len(group):
-            found |= {id(view) for view, far in zip(group, crowd.astray(positions), strict=True) if far}
-    return found
-
-
 def _may_lie(view: View, header: ImageHeader) -> bool:
     """Whether nothing tells which way up the poses mean a picture that its EXIF orientation would turn."""
     if view.orientation != 1 or header.orientation == 1:
@@ -230,13 +210,13 @@ def _may_lie(view: View, header: ImageHeader) -> bool:
 
 def _tell(
     frames: Sequence[Frame], headers: dict[int, ImageHeader], made: dict[int, View], wrong: dict[int, InputError],
-    astray: set[int], messages: list[str],
+    by_pose: set[int], messages: list[str],
 ) -> None:  # fmt: skip
     """Sentences on what was left out, turned and scaled, of this split's frames and those of the training."""
     views = list(made.values())
     if wrong:
         messages.append(f"{len(wrong)} images do not fit the others and are left out: {next(iter(wrong.values()))}")
-    far = [view.frame.listed for view in views if id(view) in astray]
+    far = [view.frame.listed for view in views if id(view) in by_pose]
     if far:
         messages.append(
             f"{len(far)} of {len(views)} cameras lie astray, far from all others, as structure from motion leaves them; they "

@@ -43,7 +43,10 @@ def map_threads(function: Callable[[Item], Made], items: Iterable[Item], threads
 
     ``threads``: how many; None: one for every core this process may use.
     """
-    with ThreadPoolExecutor(usable_cores() if threads is None else max(1, threads)) as pool:
+    count = usable_cores() if threads is None else max(1, threads)
+    if count == 1:
+        return list(map(function, items))
+    with ThreadPoolExecutor(count) as pool:
         return list(pool.map(function, items))
 
 

@@ -22,6 +22,24 @@ from nerfvol.errors import InputError
 HOLD_OUT_EVERY = 8
 MOST_LOST = 0.5
 """Share of the frames that may lack a usable pose; a set that loses more is refused."""
+FEW, ENOUGH_TO_JUDGE = 0.1, 10
+"""Share of the frames that may be left out because they are damaged or do not fit the others, and of how many at least."""
+
+
+def are_few(wrong: int, n: int) -> bool:
+    """Whether so many of ``n`` frames may be left out."""
+    return wrong <= max(1, FEW * n) and n >= ENOUGH_TO_JUDGE
+
+
+def require_few(wrong: Sequence[InputError], n: int) -> None:
+    """The first of the errors, raised where so many of ``n`` frames may not be left out."""
+    if wrong and not are_few(len(wrong), n):
+        raise wrong[0]
+
+
+def with_count(errors: Sequence[InputError]) -> str:
+    """The first of the errors, and how many more there are."""
+    return f"{errors[0]}" + (f" (and {len(errors) - 1} more)" if len(errors) > 1 else "")
 
 
 def named(names: Sequence[str], most: int = 3) -> str:
@@ -39,20 +57,27 @@ class Poses:
         self.where = where
         self.lost: list[str] = []
         self.scaled: dict[str, float] = {}
+        self.unusable: list[InputError] = []
         self.count = 0
+
+    def leave_out(self, error: InputError) -> None:
+        """A frame that cannot be used, for the reason that ``error`` says."""
+        self.count += 1
+        self.unusable.append(error)
 
     def read(self, listed: str, matrix: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """The rigid pose (4, 4) of the frame ``listed``; None where its matrix is not finite, as trackers write that they
         lost it.
 
         Raises:
-            InputError: see rigid_pose.
+            InputError: see rigid_pose; the frame does not count yet.
         """
-        self.count += 1
         if matrix.shape in ((3, 4), (4, 4)) and not np.isfinite(matrix).all():
+            self.count += 1
             self.lost.append(listed)
             return None
         pose, scale = unscaled_pose(matrix)
+        self.count += 1
         if scale != 1:
             self.scaled[listed] = scale
         return pose
@@ -61,9 +86,13 @@ class Poses:
         """Sentences on what was left out or changed.
 
         Raises:
-            InputError: more than half of the frames have no usable pose.
+            InputError: more than half of the frames have no finite pose, or more than a few cannot be used.
         """
+        require_few(self.unusable, self.count)
         said = []
+        if self.unusable:
+            n = len(self.unusable)
+            said.append(f"{n} of {self.count} frames cannot be used and are left out: {with_count(self.unusable)}")
         if len(self.lost) > MOST_LOST * self.count:
             raise InputError(
                 f"{self.where}: the poses of {len(self.lost)} of {self.count} frames hold NaN or infinity instead of finite "
@@ -144,74 +173,6 @@ def hold_out(frames: list[Frame], split: str) -> tuple[list[Frame], list[Frame],
     return (kept if split == "train" else held), kept, sentence
 
 
-class MaskFinder:
-    """Masks by the conventions of other programs: what a file names, ``dynamic_mask_NAME`` and folders of masks."""
-
-    def __init__(self, folder: Path, images: Path | None = None) -> None:
-        """``folder``: of the data set; ``images``: of the photographs, where masks folders may lie too."""
-        self._finder = ImageFinder(folder)
-        self._beside: dict[Path, ImageFinder] = {}
-        homes = [folder] if images is None or images == folder else [folder, images, images.parent]
-        places = dict.fromkeys(home / name for home in homes for name in ("masks", "mask"))
-        self._folders = [place for place in places if place.is_dir()]
-        self._in_use: set[Path] = set()
-        self.missing: list[str] = []
-
-    def of(self, listed: str, path: Path | None, stated: str | None = None) -> tuple[MaskFile, ...]:
-        """The masks of the image ``listed`` at ``path``; ``stated``: what its file names as such."""
-        if path is None:
-            return ()
-        found = []
-        if stated is not None:
-            mask = self._finder.find(stated)
-            if mask is None:
-                self.missing.append(stated)
-            else:
-                found.append(MaskFile(mask))
-        beside = self._beside.setdefault(path.parent, ImageFinder(path.parent))
-        named_so = beside.mentions("mask")  # names of all that is looked for there
-        for name in (f"dynamic_mask_{path.name}", f"dynamic_mask_{path.stem}") if named_so else ():
-            if (mask := beside.find(name)) is not None:
-                found.append(MaskFile(mask, black_is_out=False))
-                break
-        for name in _beside(path) if named_so and not found else ():
-            if (mask := beside.find(name)) is not None and mask != path:
-                return (MaskFile(mask),)
-        if not found:
-            found += self._in_folders(listed, path)
-        return tuple(found)
-
-    def _in_folders(self, listed: str, path: Path) -> list[MaskFile]:
-        """COLMAP's: the image's name and .png, below a folder of masks; or the image's stem, alone or as Metashape ends it."""
-        for folder in self._folders:
-            finder = self._beside.setdefault(folder, ImageFinder(folder))
-            inside = listed.replace("\\", "/")
-            for name in (f"{inside}.png", f"{path.name}.png", inside, path.stem, *_beside(path)):
-                if path.parent != folder and (mask := finder.find(name)) is not None and mask != path:
-                    self._in_use.add(folder)
-                    return [MaskFile(mask)]
-        return []
-
-    def messages(self, frames: Sequence[Frame]) -> list[str]:
-        """Sentences on the masks of ``frames``."""
-        with_mask = [frame.listed for frame in frames if frame.masks]
-        said = []
-        if with_mask:
-            said.append(
-                f"{len(with_mask)} of {len(frames)} images have masks: what those leave out takes no part in training "
-                "and scores"
-            )
-        if idle := [folder for folder in self._folders if folder not in self._in_use and not with_mask and frames]:
-            said.append(
-                f"{idle[0]} is not used: none of its files is named like an image (NAME.png, NAME.jpg.png or NAME_mask.png)"
-            )
-        if self.missing:
-            said.append(
-                f"{len(self.missing)} masks that are named are not on disk, and their images count whole: {named(self.missing)}"
-            )
-        return said
-
-
 def listed_names(frames: Sequence[Frame]) -> list[str]:
     """One unique name a frame, fit for a file name: the image's stem, or its path with _ for / where stems repeat."""
     paths = [Path(frame.listed.replace("\\", "/")) for frame in frames]
@@ -221,11 +182,6 @@ def listed_names(frames: Sequence[Frame]) -> list[str]:
         return stems
     long = ["_".join(part for part in p.parts if part not in (".", "..", "/")) for p in paths]
     return [f"{i:04d}_{name}" for i, name in enumerate(long)] if len(set(long)) < len(long) else long
-
-
-def _beside(path: Path) -> tuple[str, str, str]:
-    """What RealityCapture and Metashape call the mask of the image ``path``, without the suffix."""
-    return f"{path.name}.mask", f"{path.stem}.mask", f"{path.stem}_mask"
 
 
 def is_photograph(path: Path) -> bool:
@@ -282,7 +238,11 @@ class ImageFinder:
         for suffix in SUFFIXES:
             if stem + suffix in names:
                 return names[stem + suffix]
-        return None
+        bare, _, end = stem.rpartition(".")
+        others = [
+            names[bare + suffix] for suffix in SUFFIXES if bare and f".{end}" in SUFFIXES and bare + suffix in names
+        ]
+        return others[0] if len(others) == 1 else None  # pictures that were converted after they were listed
 
     def _names(self, folder: Path) -> dict[str, Path]:
         if folder not in self._listings:

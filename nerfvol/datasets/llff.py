@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.colmap_files import read_images
-from nerfvol.datasets.listing import Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
+from nerfvol.datasets.listing import Frame, Listing, Poses, is_photograph, named
+from nerfvol.datasets.masks import MaskFinder
+from nerfvol.datasets.split_lists import split_frames
 from nerfvol.errors import InputError
 from nerfvol.files.numpyfile import read_npy
 
@@ -48,15 +50,14 @@ def read(folder: Path, split: str) -> Listing:
         matrix = row[:15].reshape(3, 5)
         down, right, back, position = matrix[:, :4].T
         try:
+            calibration = _calibration(matrix[:, 4])
             c2w = poses.read(name, np.stack([right, -down, back, position], axis=1))
             if c2w is not None:
-                frames.append(
-                    Frame(name, images / name, c2w, _calibration(matrix[:, 4]), masks.of(name, images / name))
-                )
+                frames.append(Frame(name, images / name, c2w, calibration, masks.of(name, images / name)))
         except InputError as error:
-            raise InputError(f"{path}, image {name}: {error}") from None
+            poses.leave_out(InputError(f"{path}, image {name}: {error}"))
     said += poses.messages() + masks.messages(frames)
-    chosen, training, sentence = hold_out(frames, split)
+    chosen, training, split_said = split_frames(frames, split, [folder])
     depths = rows[(rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & (rows[:, 16] < 1e15), 15:]
     if not len(depths):
         near, far = rows[0, 15:]
@@ -65,7 +66,7 @@ def read(folder: Path, split: str) -> Listing:
         said.append(f"{len(rows) - len(depths)} of {len(rows)} rows of {path.name} state no depths with 0 < near < far: the "
                     "others' count")  # fmt: skip
     near, far = float(depths[:, 0].min()), float(depths[:, 1].max())
-    return Listing(chosen, training, path, BoundsHint(near_far=(near, far)), [*said, sentence])
+    return Listing(chosen, training, path, BoundsHint(near_far=(near, far)), said + split_said)
 
 
 def _registered(folder: Path, images: Path, names: list[str], count: int) -> tuple[list[str], list[str]]:

@@ -14,10 +14,10 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.bounds import bounds_of_box, bounds_of_points, estimate_bounds, require_seen
 from nerfvol.datasets.dataset import Dataset, evenly
+from nerfvol.datasets.extras import unread
 from nerfvol.datasets.formats import SPLITS, find_format
 from nerfvol.datasets.frames import (
     View,
-    require_few,
     unread_sentence,
     views_of,
     with_circles,
@@ -36,7 +36,8 @@ from nerfvol.datasets.images import (
     writeable,
 )
 from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
-from nerfvol.datasets.listing import Frame, Listing, listed_names, named
+from nerfvol.datasets.listing import Frame, Listing, listed_names, named, require_few
+from nerfvol.datasets.odd_ones import blank
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError, shown
 from nerfvol.files.unchanged import while_unchanged
@@ -87,11 +88,12 @@ def load_dataset(
     box = None if aabb is None else check_box(aabb, "aabb")
     if holdout not in HOLDOUTS:
         raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
-    reader = find_format(Path(path)).reader
+    row = find_format(Path(path))
+    reader = row.reader
     listing = (
         reader.read(Path(path), split) if holdout == "own" else _without_arc(reader.read(Path(path), "train"), split)
     )
-    messages = list(listing.messages)
+    messages = [*listing.messages, *unread(Path(path), row)]
     frames = _present(listing, messages)
     training = [f for f in listing.training if f.path is not None] or frames
     views, training_views = views_of(frames, training, listing.source, messages, threads)
@@ -121,6 +123,11 @@ def load_dataset(
         images, masks = decode()
     for picture in sampled.values():
         picture.take()
+    if nothing := blank(views, images, messages):
+        rows = zip(views, cameras, images, masks, strict=True)
+        kept = [row for i, row in enumerate(rows) if i not in nothing]
+        views, cameras = [row[0] for row in kept], [row[1] for row in kept]
+        images, masks = [row[2] for row in kept], [row[3] for row in kept]
     require_seen(bounds, cameras)
     messages += _on_masks(views, masks, images)
     store = ImageStore(len(images), lambda: decode()[0], images)
@@ -158,7 +165,10 @@ def _scene_of(
     decision = decide(asked, evidence, cameras, focus_point(cameras), hint.near_far is not None)
     has_alpha, bounded = evidence.see_through, decision.kind == "object"
     if box is not None:
-        return bounds_of_box(box, has_alpha, bounded), decision, "scene bounds: the aabb as given"
+        return bounds_of_box(box, has_alpha, bounded), decision, _of_box(box, cameras, "the aabb as given")
+    if hint.aabb is not None:
+        said = _of_box(hint.aabb, cameras, "the aabb of the file")
+        return estimate_bounds(cameras, has_alpha, hint, decision.kind)[0], decision, said
     bounds, said = estimate_bounds(cameras, has_alpha, hint, decision.kind)
     if bounds.is_guess and listing.read_points is not None:
         points = listing.read_points()
@@ -166,6 +176,18 @@ def _scene_of(
         if len(good) >= 100:
             return bounds_of_points(good, bounds), decision, f"scene bounds: around the points of {points.source}"
     return bounds, decision, said
+
+
+def _of_box(box: NDArray[np.float64], cameras: Sequence[Camera], what: str) -> str:
+    """A sentence on bounds that are stated; where the cameras look at a point beside them, that too."""
+    focus = focus_point(cameras)
+    aside = (focus.point <= box[0]).any() or (focus.point >= box[1]).any()
+    if not (focus.is_clear and aside):
+        return f"scene bounds: {what}"
+    point = " ".join(f"{v:.4g}" for v in focus.point)
+    return (
+        f"scene bounds: {what}, beside the point that all cameras look at ({point}): is it in the units of the poses?"
+    )
 
 
 @dataclass(eq=False)

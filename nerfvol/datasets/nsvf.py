@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.datasets.bounds import BoundsHint
-from nerfvol.datasets.listing import MOST_LOST, Frame, Listing, MaskFinder, Poses, hold_out, is_photograph, named
+from nerfvol.datasets.listing import MOST_LOST, Frame, Listing, Poses, hold_out, is_photograph, named
+from nerfvol.datasets.masks import MaskFinder
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_text
 from nerfvol.region import check_box
@@ -49,7 +50,11 @@ def read(folder: Path, split: str) -> Listing:
     for image in images:
         if image.name in bare:
             continue
-        c2w = _pose(poses, image.name, folder / _POSES / f"{image.stem}.txt")
+        try:
+            c2w = _pose(poses, image.name, folder / _POSES / f"{image.stem}.txt")
+        except InputError as error:
+            poses.leave_out(error)
+            continue
         if c2w is None:
             continue
         frame = Frame(image.name, image, c2w, calibration, masks.of(image.name, image))

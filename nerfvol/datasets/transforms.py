@@ -14,10 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras.calibration import CALIBRATION_KEYS, Calibration, finite_number, read_calibration, read_matrix
+from nerfvol.cameras.calibration import (
+    CALIBRATION_KEYS,
+    Calibration,
+    calibration_doubts,
+    finite_number,
+    read_calibration,
+    read_matrix,
+)
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.formats import SPLITS
-from nerfvol.datasets.listing import Frame, ImageFinder, Listing, MaskFinder, Poses, hold_out, named
+from nerfvol.datasets.listing import Frame, ImageFinder, Listing, Poses, named
+from nerfvol.datasets.masks import MaskFinder
+from nerfvol.datasets.split_lists import chosen_by_lists, resolved, split_frames
 from nerfvol.errors import InputError, shown
 from nerfvol.files.atomic import read_json
 from nerfvol.files.unchanged import while_unchanged
@@ -54,12 +63,12 @@ def read(path: Path, split: str) -> Listing:
             messages.append(
                 f"{files[name].name} lists {n} cameras without pictures: it cannot be scored against, and is left out"
             )
+    if (path / "transforms.json").is_file():
+        messages.append(f"transforms.json is not read: {' and '.join(file.name for file in files.values())} come first")
     if "val" not in read_files and "test" not in read_files:
         listing = _single(read_files["train"], split)
         listing.messages[:0] = messages
         return listing
-    if (path / "transforms.json").is_file():
-        messages.append(f"transforms.json is not read: {' and '.join(file.name for file in files.values())} come first")
     used = split
     other = {"val": "test", "test": "val"}.get(split)
     if split not in read_files and other is not None and other in read_files:
@@ -84,44 +93,14 @@ def _unused(path: Path, files: Mapping[str, Path], split: str) -> list[str]:
 def _single(file: _File, split: str) -> Listing:
     """A split of one file, by its own lists or by holding out."""
     frames, messages = file.frames, list(file.messages)
-    lists = file.lists
-    present = [frame for frame in frames if frame.path is not None]
-    missing = [frame for frame in frames if frame.path is None]
-    if lists:
-        unknown = sorted(name for names in lists.values() for name in names - {frame.listed for frame in frames})
-        if unknown:
-            messages.append(f"{len(unknown)} names in the lists of {file.path.name} are no frame's: {named(unknown)}")
-    taken = lists.get("train")
-    held = lists.get("test" if split == "test" else "val") or lists.get("val") or lists.get("test")
-    if taken is not None or held is not None:
-        everything = {frame.listed for frame in frames}
-        if taken is None:
-            taken = everything - set().union(*lists.values())
-            messages.append(f"{file.path.name} lists views to hold out and none to train on: all others are trained on")
-        if held is None:
-            held = everything - taken
-            messages.append(
-                f"{file.path.name} lists views to train on and none to hold out: the {len(held)} others are held out"
-            )
-        left = everything - taken - set().union(*(lists.get(name, set()) for name in ("val", "test")), held)
-        if left:
-            messages.append(
-                f"{len(left)} frames are in no list of {file.path.name} and are not used: {named(sorted(left))}"
-            )
-        if both := sorted(taken & held):
-            messages.append(f"{len(both)} views are trained on and held out too, so that scores flatter: {named(both)}")
-        wanted = taken if split == "train" else held
-        training = [f for f in present if f.listed in taken]
-        if not wanted & everything or (split != "train" and not any(f.listed in held for f in present)):
-            which = "train" if split == "train" else "val"
-            raise InputError(
-                f"{file.path}: no frame is left for the {which} views; list some in {which}_filenames, or leave the lists out"
-            )
-        return Listing([f for f in frames if f.listed in wanted], training, file.path, file.hint, messages)
-    if not present:
+    if file.lists:
+        chosen, training, said = chosen_by_lists(frames, file.lists, split, file.path)
+        return Listing(chosen, training, file.path, file.hint, messages + said)
+    if not file.present:
         return Listing(frames, frames, file.path, file.hint, messages)
-    chosen, training, sentence = hold_out(present, split)
-    return Listing(chosen + missing, training, file.path, file.hint, [*messages, sentence])
+    chosen, training, said = split_frames(frames, split, [file.path.parent])
+    missing = [frame for frame in frames if frame.path is None]
+    return Listing(chosen + missing, training, file.path, file.hint, messages + said)
 
 
 class _File:
@@ -135,6 +114,8 @@ class _File:
         stated = _stated(path)
         data, poses = stated.data, stated.poses
         self.lists = _named_splits(data, path)
+        if stated.test and not self.lists:
+            self.lists = {"test": stated.test}
         finder, masks = ImageFinder(path.parent), MaskFinder(path.parent)
         self.frames = []
         for entry in stated.entries:
@@ -147,6 +128,18 @@ class _File:
             raise InputError(f"{path}: {error}") from None
         self.messages = poses.messages() + masks.messages([f for f in self.frames if f.path is not None])
         self.messages += _not_used(path, data)
+        points = data.get("ply_file_path")
+        if isinstance(points, str) and "\0" not in points and not (path.parent / points).is_file():
+            self.messages.append(f"{path.name} names points in {shown(points)}, which is not on disk")
+        if stated.doubts:
+            self.messages.append(f"{path.name} states {named(stated.doubts)}")
+        doubled = _doubled(self.frames)
+        if doubled:
+            self.frames = [frame for frame in self.frames if id(frame) not in doubled]
+            names = [doubled[key] for key in doubled]
+            self.messages.append(
+                f"{len(names)} frames are in the file twice, with the same pose: once is enough: {named(names)}"
+            )
         if len({frame.listed for frame in self.frames}) < len(self.frames):
             listed = [frame.listed for frame in self.frames]
             twice = sorted({name for name in listed if listed.count(name) > 1})
@@ -158,6 +151,17 @@ class _File:
     def present(self) -> bool:
         """Whether any of its images is there."""
         return any(frame.path is not None for frame in self.frames)
+
+
+def _doubled(frames: list[Frame]) -> dict[int, str]:
+    """Names, by id, of the frames that say the same as one before them."""
+    first: dict[tuple[str, str | None], Frame] = {}
+    found = {}
+    for frame in frames:
+        same = first.setdefault((frame.listed, frame.light), frame)
+        if same is not frame and np.array_equal(same.c2w, frame.c2w):
+            found[id(frame)] = frame.listed
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,29 +177,45 @@ class _Entry:
 
 @dataclass(frozen=True, eq=False)
 class _Stated:
-    """What a file says, whatever else is on the disk: all of it, its entries that have a pose, and what became of poses."""
+    """What a file says, whatever else is on the disk: all of it, its entries that have a pose, what became of poses, the
+    names of those that it has as test frames, and doubts about calibrations."""
 
     data: dict[str, Any]
     entries: list[_Entry]
     poses: Poses
+    test: set[str]
+    doubts: list[str]
 
 
 @while_unchanged(3)
 def _stated(path: Path) -> _Stated:
     """The file's content."""
     data, poses, entries = _load_json(path), Poses(path), []
-    shared = {key: value for key, value in data.items() if key != "frames"}
+    shared = {key: value for key, value in data.items() if key not in ("frames", "test_frames")}
+    tests = data.get("test_frames")
+    tests = tests if isinstance(tests, list) else []  # ScanNet++
+    doubts: dict[str, int] = {}
     common: Calibration | None = None
-    for number, entry in enumerate(data["frames"]):
+    for number, entry in enumerate([*data["frames"], *tests]):
         where = f"{path}, frame {number}"
-        if not isinstance(entry, dict):
-            raise InputError(f"{where}: expected an object with file_path and transform_matrix, got {shown(entry):.60}")
-        own = not CALIBRATION_KEYS.isdisjoint(entry)
-        found = _entry(where, entry, shared, poses, None if own else common)
+        try:
+            if not isinstance(entry, dict):
+                raise InputError(
+                    f"{where}: expected an object with file_path and transform_matrix, got {shown(entry):.60}"
+                )
+            own = not CALIBRATION_KEYS.isdisjoint(entry)
+            found = _entry(where, entry, shared, poses, None if own else common)
+        except InputError as error:
+            poses.leave_out(error)
+            continue
         if found is not None:
+            if own or common is None:
+                for doubt in calibration_doubts({**shared, **entry}):
+                    doubts[doubt] = doubts.get(doubt, 0) + 1
             common = common if own else found.calibration
             entries.append(found)
-    return _Stated(data, entries, poses)
+    listed = {e["file_path"] for e in tests if isinstance(e, dict) and isinstance(e.get("file_path"), str)}
+    return _Stated(data, entries, poses, listed & {entry.listed for entry in entries}, list(doubts))
 
 
 def _entry(
@@ -213,8 +233,8 @@ def _entry(
     if mask is not None and (not isinstance(mask, str) or "\0" in mask):
         raise InputError(f"{where}: expected mask_path to name an image, got {shown(mask):.60}")
     try:
-        c2w = poses.read(listed, read_matrix(entry["transform_matrix"]))
         calibration = calibration or read_calibration(everything)
+        c2w = poses.read(listed, read_matrix(entry["transform_matrix"]))
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     light = everything.get("light")
@@ -225,7 +245,7 @@ def _entry(
 LONGEST_NAME = 200
 """Letters of a picture's name that sentences show whole."""
 _USED = {"frames", "file_path", "transform_matrix", "mask_path", "aabb", "aabb_scale", "ply_file_path",
-         *CALIBRATION_KEYS, *(f"{split}_filenames" for split in SPLITS)}  # fmt: skip
+         "test_frames", *CALIBRATION_KEYS, *(f"{split}_filenames" for split in SPLITS)}  # fmt: skip
 _EMPTY = (None, "", [], {}, 0, 0.0, False)
 
 
@@ -237,19 +257,16 @@ def _not_used(path: Path, data: Mapping[str, Any]) -> list[str]:
         return key not in _USED and value not in _EMPTY and not named_light
 
     top = sorted(key for key, value in data.items() if unused(key, value))
-    inside = {key for entry in data["frames"] for key, value in entry.items() if unused(key, value)}
+    entries = [entry for entry in data["frames"] if isinstance(entry, dict)]
+    inside = {key for entry in entries for key, value in entry.items() if unused(key, value)}
     told = [*top, *(f"{key} (of frames)" for key in sorted(inside))]
     return [f"{path.name} states what is not used: {named(told, 8)}"] if told else []
 
 
 def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
     """nerfstudio's train_filenames, val_filenames and test_filenames, those that are there; ./ and \\ as frames have them."""
-    by_name = {_plain(entry["file_path"]): entry["file_path"] for entry in data["frames"]
-               if isinstance(entry, dict) and isinstance(entry.get("file_path"), str)}  # fmt: skip
-    by_end = {}
-    for name, listed in by_name.items():  # lists of bare names, where they tell
-        by_end[name.rpartition("/")[2]] = None if name.rpartition("/")[2] in by_end else listed
-    by_stem = {name.rpartition(".")[0] or name: listed for name, listed in by_name.items()}
+    entries = [entry for entry in data["frames"] if isinstance(entry, dict)]
+    listed = [entry["file_path"] for entry in entries if isinstance(entry.get("file_path"), str)]
     found = {}
     for split in SPLITS:
         names = data.get(f"{split}_filenames")
@@ -257,17 +274,8 @@ def _named_splits(data: Mapping[str, Any], path: Path) -> dict[str, set[str]]:
             continue
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise InputError(f"{path}: {split}_filenames must be a list of file names, got {shown(names):.60}")
-        plain = [_plain(name) for name in names]
-        found[split] = {
-            by_name.get(name) or by_stem.get(name.rpartition(".")[0] or name) or by_end.get(name) or name
-            for name in plain
-        }
+        found[split] = resolved(names, listed)
     return found
-
-
-def _plain(name: str) -> str:
-    """A path in one spelling."""
-    return "/".join(part for part in name.replace("\\", "/").split("/") if part not in ("", "."))
 
 
 def _load_json(path: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfvol.cameras.camera import Intrinsics
+from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.errors import InputError
 from nerfvol.export.surface import Cameras
 from nerfvol.export.transforms import require_cameras
@@ -56,6 +57,11 @@ def _camera(lens: Intrinsics) -> str:
     k = lens.lens.coefficients
     if lens.fisheye:
         return f"OPENCV_FISHEYE {size} {_numbers([*focal, *(k.get(f'k{i}', 0.0) for i in (1, 2, 3, 4))])}"
+    if isinstance(lens.lens, Rational):
+        order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        return f"FULL_OPENCV {size} {_numbers([*focal, *(k[name] for name in order)])}"
+    if isinstance(lens.lens, FieldOfView):
+        return f"FOV {size} {_numbers([*focal, k['omega']])}"
     if set(k) - {"k1", "k2", "k3", "k4", "p1", "p2"}:
         raise InputError(f"COLMAP has no lens of the kind {type(lens.lens).__name__}")
     four = [k.get(name, 0.0) for name in ("k1", "k2", "p1", "p2")]

@@ -22,6 +22,7 @@ from nerfvol.export.tsdf import Mesh, mesh_of_shots, require_library
 from nerfvol.files.atomic import atomic_write
 from nerfvol.files.pictures import srgb_to_linear
 from nerfvol.models import Model
+from nerfvol.splats.near import offset_for
 from nerfvol.splats.plyfile import write_ply
 
 VIEWS = 60
@@ -58,27 +59,38 @@ def write(
     return _WRITERS[ending](path, Mesh(mesh.vertices @ turn.T, mesh.faces, mesh.colours))
 
 
+_DIGITS = 1e-5
+"""Of the mesh's extent: where float32 rounds vertices by more, formats that can hold more of them."""
+
+
+def _offset(mesh: Mesh) -> NDArray[np.float64]:
+    """(3,) what vertices are to be relative to; 0 where float32 holds them as they are."""
+    return offset_for(mesh.vertices, _DIGITS * float(np.ptp(mesh.vertices, axis=0).max(initial=0.0)))
+
+
 def _write_ply(path: str | os.PathLike[str], mesh: Mesh) -> int:
-    columns: dict[str, NDArray] = {n: mesh.vertices[:, k].astype(np.float32) for k, n in enumerate("xyz")}
+    kind = np.float64 if _offset(mesh).any() else np.float32
+    columns: dict[str, NDArray] = {n: mesh.vertices[:, k].astype(kind) for k, n in enumerate("xyz")}
     columns |= {n: _bytes(mesh.colours)[:, k] for k, n in enumerate(("red", "green", "blue"))}
     return write_ply(path, [], columns, mesh.faces)
 
 
 def _write_obj(path: str | os.PathLike[str], mesh: Mesh) -> int:
+    vertex = "{:.15g} {:.15g} {:.15g}" if _offset(mesh).any() else "{:.6g} {:.6g} {:.6g}"
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii") as file:
         file.write("# nerfvol; colours sRGB\n")
         rows = np.hstack([mesh.vertices, mesh.colours])
         for at in range(0, len(rows), _RUN):
-            file.writelines(
-                "v {:.6g} {:.6g} {:.6g} {:.4f} {:.4f} {:.4f}\n".format(*row) for row in rows[at : at + _RUN]
-            )
+            file.writelines(f"v {vertex} {{:.4f}} {{:.4f}} {{:.4f}}\n".format(*row) for row in rows[at : at + _RUN])
         for at in range(0, len(mesh.faces), _RUN):
             file.writelines("f {} {} {}\n".format(*face) for face in mesh.faces[at : at + _RUN] + 1)
         return file.tell()
 
 
 def _write_glb(path: str | os.PathLike[str], mesh: Mesh) -> int:
-    vertices = mesh.vertices.astype("<f4")
+    offset = _offset(mesh)
+    vertices = (mesh.vertices - offset).astype("<f4")
+    node = {"mesh": 0, "name": "nerfvol"} | ({"translation": offset.tolist()} if offset.any() else {})
     colours = np.full((len(vertices), 4), 65535, "<u2")  # bytes would show steps where it is dark: they are linear
     colours[:, :3] = np.rint(65535 * srgb_to_linear(np.clip(mesh.colours, 0, 1)))
     parts = [vertices.tobytes(), colours.tobytes(), mesh.faces.astype("<u4").tobytes()]
@@ -92,7 +104,7 @@ def _write_glb(path: str | os.PathLike[str], mesh: Mesh) -> int:
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "nerfvol"}],
+        "nodes": [node],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}],
         "materials": [{
             "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from nerfvol.errors import InputError
+from nerfvol.errors import InputError, shown
 from nerfvol.files.atomic import atomic_write, explain_os_error
 
 _NAMES = {
@@ -100,13 +100,13 @@ class ArrayFile:
         """The numpy dtype of the array ``name``."""
         code = self._codes[name]
         if code not in _DTYPES:
-            raise self.fault(f"array {name!r} has dtype {code}, which nerfvol does not use")
+            raise self.fault(f"array {shown(name)} has dtype {code}, which nerfvol does not use")
         return np.dtype(_DTYPES[code])
 
     def expect(self, name: str, dtype: str, shape: tuple[int | None, ...]) -> tuple[int, ...]:
         """Check the array's declared dtype and shape (None = any length) without reading it; returns the shape."""
         if name not in self.shapes:
-            raise self.fault(f"array {name!r} is missing")
+            raise self.fault(f"array {shown(name)} is missing")
         found = self.shapes[name]
         fits = len(found) == len(shape) and all(
             want is None or want == have for want, have in zip(shape, found, strict=True)
@@ -114,7 +114,9 @@ class ArrayFile:
         if not fits or self.dtype(name) != np.dtype(dtype):
             wanted = "×".join("n" if n is None else str(n) for n in shape)
             came = "×".join(map(str, found)) or "scalar"
-            raise self.fault(f"array {name!r} should be {dtype} of shape {wanted}, it is {self.dtype(name)} of {came}")
+            raise self.fault(
+                f"array {shown(name)} should be {dtype} of shape {wanted}, it is {self.dtype(name)} of {came}"
+            )
         return found
 
     def read(self, name: str) -> np.ndarray:
@@ -124,7 +126,7 @@ class ArrayFile:
             InputError: there is no such array, its dtype is not one of numpy's, or it cannot be read.
         """
         if name not in self.shapes:
-            raise self.fault(f"array {name!r} is missing")
+            raise self.fault(f"array {shown(name)} is missing")
         self.dtype(name)
         try:
             return self._file.get_tensor(name)
@@ -140,7 +142,7 @@ class ArrayFile:
             InputError: there is no such array, its dtype is not one of numpy's, or it cannot be mapped.
         """
         if name not in self.shapes:
-            raise self.fault(f"array {name!r} is missing")
+            raise self.fault(f"array {shown(name)} is missing")
         dtype, shape = self.dtype(name), self.shapes[name]
         if not np.prod(shape):
             return np.empty(shape, dtype)

@@ -13,7 +13,8 @@ import numpy as np
 from PIL import Image
 
 from nerfvol.datasets.images import image_header, image_size, map_threads, read_mask
-from nerfvol.datasets.listing import MaskFile, MaskFinder
+from nerfvol.datasets.listing import MaskFile
+from nerfvol.datasets.masks import MaskFinder
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write
 from nerfvol.poses.sources import HEIF_SUFFIXES, Photograph

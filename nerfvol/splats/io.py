@@ -124,7 +124,7 @@ def _check_document(file: ArrayFile) -> None:
     if document.get("format") != FORMAT:
         raise file.fault(f"expected the format {FORMAT!r}, it says {shown(document.get('format'))}")
     if document.get("version") != VERSION:
-        raise file.fault(f"this nerfvol reads version {VERSION}, it has version {document.get('version')!r}")
+        raise file.fault(f"this nerfvol reads version {VERSION}, it has version {shown(document.get('version'))}")
     expected = (
         ("colour", (COLOUR_CONVENTION,)),
         ("footprint_variance", (FOOTPRINT_VARIANCE,)),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.splats.near import relative
 from nerfvol.splats.plyfile import PlyFile, write_ply
 from nerfvol.splats.splats import Splats
 
@@ -28,13 +29,15 @@ LARGEST_COEFFICIENT = 1e6
 LARGEST_LOG_SCALE = 40.0
 LARGEST_LOGIT = 80.0
 _SHORTEST = 1e-12  # of a quaternion that still is a direction
+_ORIGIN = "nerfvol origin"
 _WRITTEN = {"mip": "mip", "plain": "default"}
 
 
 def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
     """Write ``splats`` to the PLY file ``path`` atomically and return its size in bytes.
 
-    Positions are absolute float32. Quaternions are written as they are, so that a file that is read and written again has
+    Positions are float32, absolute or, where map coordinates would lose their digits so, relative to the point of a comment
+    ``nerfvol origin: X Y Z``. Quaternions are written as they are, so that a file that is read and written again has
     the same bytes.
 
     Raises:
@@ -45,9 +48,7 @@ def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
     except InputError as error:
         raise InputError(f"cannot write {path}: {error}") from error
     columns: dict[str, NDArray[np.float32]] = {}
-    means = splats.means.astype(np.float64) + splats.origin if np.any(splats.origin) else splats.means
-    with np.errstate(over="ignore"):
-        means = means.astype(np.float32)
+    means, offset = relative(splats) if np.any(splats.origin) else (splats.means, np.zeros(3))
     if not np.isfinite(means).all():
         raise InputError(f"cannot write {path}: positions are too large for the format's float32")
     columns |= {name: means[:, k] for k, name in enumerate("xyz")}
@@ -58,25 +59,10 @@ def save_ply(path: str | os.PathLike[str], splats: Splats) -> int:
     columns["opacity"] = splats.logits
     columns |= {f"scale_{k}": splats.log_scales[:, k] for k in range(3)}
     columns |= {f"rot_{k}": splats.quats[:, k] for k in range(4)}
-    return write_ply(path, [f"SplatRenderMode: {_WRITTEN[splats.mode]}"], columns)
-
-
-def lost_digits(splats: Splats) -> str | None:
-    """A sentence where the format's float32 positions are coarser than the splats themselves; None: they are not.
-
-    The layout has no double positions, and viewers read none: such splats are moved to near the origin before they are written.
-    """
-    far = float(np.abs(splats.origin).max())
-    rounding, width = (
-        float(np.spacing(np.float32(far))),
-        float(np.exp(np.median(splats.log_scales))) if splats.n else 1.0,
-    )
-    if rounding <= width:
-        return None
-    return (
-        f"the positions lie {far:.3g} from the origin, where the format's float32 is {rounding:.2g} coarse and a splat "
-        f"{width:.2g} wide: poses nearer to the origin keep them apart"
-    )
+    comments = [f"SplatRenderMode: {_WRITTEN[splats.mode]}"]
+    if offset.any():
+        comments.append(f"{_ORIGIN}: {' '.join(repr(float(v)) for v in offset)}")
+    return write_ply(path, comments, columns)
 
 
 def is_splat_ply(path: str | os.PathLike[str]) -> bool:
@@ -92,7 +78,8 @@ def is_splat_ply(path: str | os.PathLike[str]) -> bool:
 def load_ply(path: str | os.PathLike[str], mode: Mode = "plain") -> Splats:
     """The Gaussians of a PLY file; ``mode`` is what they are taken for where the file does not say.
 
-    Binary of either byte order and ascii; columns in any order; others are ignored. The origin is 0.
+    Binary of either byte order and ascii; columns in any order; others are ignored. The origin is that
+    of a comment (see save_ply), else 0.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.
@@ -113,7 +100,7 @@ def load_ply(path: str | os.PathLike[str], mode: Mode = "plain") -> Splats:
         splats = Splats(
             means=columns("x", "y", "z"), log_scales=_log_scales(file, columns("scale_0", "scale_1", "scale_2")),
             quats=columns(*(f"rot_{k}" for k in range(4))), logits=_logits(file, columns("opacity")[:, 0]), sh=sh,
-            origin=np.zeros(3), mode=stated or mode,
+            origin=_origin(file), mode=stated or mode,
         )  # fmt: skip
         _check_values(file, splats)
         return splats
@@ -134,6 +121,21 @@ def _mode(file: PlyFile) -> Mode | None:
                 raise file.fault(f"its comment 'antialiased' says {words[1][:40]!r}, expected 0 or 1")
             return "mip" if words[1] == "1" else "plain"
     return None
+
+
+def _origin(file: PlyFile) -> NDArray[np.float64]:
+    """(3,) what positions are relative to, as a comment says."""
+    for comment in file.comments:
+        key, _, value = comment.partition(":")
+        if key.strip().lower() == _ORIGIN:
+            try:
+                origin = np.array([float(word) for word in value.split()])
+            except ValueError:
+                origin = np.zeros(0)
+            if origin.shape != (3,) or not (np.abs(origin) < LARGEST).all():
+                raise file.fault(f"its comment {_ORIGIN!r} says {value.strip()[:40]!r}, expected three finite numbers")
+            return origin
+    return np.zeros(3)
 
 
 def _check_columns(file: PlyFile) -> int:

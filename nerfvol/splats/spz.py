@@ -22,6 +22,7 @@ import numpy as np
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write, explain_os_error
 from nerfvol.machine import total_memory
+from nerfvol.splats.near import relative
 from nerfvol.splats.splats import MAX_DEGREE, Splats
 
 VERSIONS = (3, 4)
@@ -34,6 +35,8 @@ _SMALLEST_ROW = 19  # bytes of a Gaussian of degree 0 once unpacked, version 2
 _EXTENSIONS = 1 << 20  # bytes that may follow the Gaussians
 _RUN = 1 << 20  # bytes that are unpacked at a time
 _LARGEST_RATIO = 1032  # of deflate
+_FINEST_BITS, _COARSEST = 20, 4.0
+"""Of fractions, the most that files have; and the width of splats that their rounding may be."""
 _POSITION_BITS = 23  # besides the sign
 _SHORTEST = 1e-12
 
@@ -52,8 +55,9 @@ def _library() -> ModuleType:
 def save_spz(path: str | os.PathLike[str], splats: Splats, version: int = 3) -> int:
     """Write ``splats`` to the file ``path`` atomically and return its size in bytes.
 
-    Positions are rounded to 2^-k scene units, k as large as 24 bits allow; colours, scales, opacities and rotations to 8
-    to 10 bits. ``version`` 3 is read everywhere, 4 is smaller and read by few.
+    Positions are rounded to 2^-k scene units, k as large as 24 bits allow, and relative to a point near them where map
+    coordinates would lose their digits (near.relative: the format has no place for it); colours, scales, opacities and
+    rotations to 8 to 10 bits. ``version`` 3 is read everywhere, 4 is smaller and read by few.
 
     Raises:
         InputError: gsply is missing, the path cannot be written, or a value is not finite or too large.
@@ -66,16 +70,23 @@ def save_spz(path: str | os.PathLike[str], splats: Splats, version: int = 3) -> 
     except InputError as error:
         raise InputError(f"cannot write {path}: {error}") from error
     splats = _half_a_turn(splats)
-    means = splats.means.astype(np.float64) + splats.origin
+    means, _ = relative(splats)
     largest = float(np.abs(means).max(initial=0.0))
     bits = _POSITION_BITS if largest <= 1 else _POSITION_BITS - int(np.ceil(np.log2(largest * (1 + 1e-6))))
     if bits < 0:
         raise InputError(
             f"cannot write {path}: positions reach {largest:g}, an .spz file holds up to {2**_POSITION_BITS}"
         )
+    bits = min(bits, _FINEST_BITS)
+    width = float(np.exp(np.median(splats.log_scales))) if splats.n else 1.0
+    if 2.0**-bits > _COARSEST * width:
+        raise InputError(
+            f"cannot write {path}: an .spz file would round positions to {2.0**-bits:.2g} units, and half of the splats are "
+            f"narrower than {width:.2g}; a .ply keeps them"
+        )
     lengths = np.linalg.norm(splats.quats.astype(np.float64), axis=1, keepdims=True)
     data = gsply.GSData(
-        means=means.astype(np.float32), scales=splats.log_scales,
+        means=means, scales=splats.log_scales,
         quats=(splats.quats / np.maximum(lengths, _SHORTEST)).astype(np.float32),
         opacities=splats.logits, sh0=np.ascontiguousarray(splats.sh[:, :, 0]),
         shN=np.ascontiguousarray(splats.sh[:, :, 1:].transpose(0, 2, 1)),
@@ -83,7 +94,7 @@ def save_spz(path: str | os.PathLike[str], splats: Splats, version: int = 3) -> 
     )  # fmt: skip
     with atomic_write(path) as temporary:
         try:
-            gsply.write_spz(temporary, data, version=version, fractional_bits=min(bits, 20))
+            gsply.write_spz(temporary, data, version=version, fractional_bits=bits)
         except (ValueError, ImportError) as error:
             raise InputError(f"cannot write {path}: {_first_line(error)}") from error
         if splats.mode == "mip":

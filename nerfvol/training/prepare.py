@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from nerfvol.datasets.images import composite_average
 from nerfvol.datasets.load import load_dataset
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
-from nerfvol.files.atomic import ensure_writable_folder, explain_os_error
+from nerfvol.files.atomic import ensure_writable_folder, explain_os_error, read_bytes
 from nerfvol.files.run_folder import (
     CHECKPOINT,
     CONFIG,
@@ -184,7 +185,8 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
             "comes back in the units of the poses"
         )
     moved = [frame.dataset_into(d) for d in (training, held_out, compared, first)]
-    return Data(moved[0], moved[1], moved[2], moved[3], reading, frame, fingerprint(training))
+    lights = None if config.light is None else zlib.crc32(read_bytes(config.light))
+    return Data(moved[0], moved[1], moved[2], moved[3], reading, frame, fingerprint(training, lights))
 
 
 def require_same(saved: Mapping[str, Any] | None, data: Data, checkpoint: Path) -> None:
@@ -201,7 +203,7 @@ def require_same(saved: Mapping[str, Any] | None, data: Data, checkpoint: Path) 
         raise InputError(f"{checkpoint} is damaged: its record of the pictures cannot be read ({error})") from error
     if different is not None:
         raise InputError(
-            f"--resume: the pictures are not those that the run was begun with: {different}; put them back, or train again "
+            f"--resume: the data are not those that the run was begun with: {different}; put them back, or train again "
             "from the start"
         )
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from nerfvol.cameras.calibration import CAMERA_MODELS, lens_keys, read_calibration
 from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, rigid_pose, tile_pixels
+from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import PINHOLE as NO_DISTORTION
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError
@@ -27,6 +28,10 @@ LENSES = {
     "phone": PHONE.scaled(20),
     "barrel": Intrinsics(64, 48, 40.0, 41.0, 30.0, 25.0, k1=-0.2, k2=0.03, k3=0.004, k4=-0.001, p1=0.002, p2=-0.003),
     "pincushion": Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0, k1=0.3, k2=0.1),
+    "rational": Intrinsics(
+        64, 48, 40.0, 41.0, 30.0, 25.0, Rational(0.1, 0.04, 0.003, 0.15, 0.002, -0.001, 0.03, 0.001)
+    ),
+    "field of view": Intrinsics(64, 48, 40.0, 41.0, 30.0, 25.0, FieldOfView(0.9)),
     "fisheye": Intrinsics(64, 48, 20.0, 20.5, 31.0, 25.0, k1=0.02, k2=-0.01, k3=0.003, k4=-0.0004, fisheye=True),
 }
 
@@ -141,6 +146,38 @@ def test_each_coefficient_means_what_opencv_says(index):
     np.testing.assert_allclose(found[0], forward_pinhole(x, y, *coefficients), rtol=8 * EPS64)
     direction = lens.undistort(found)[0]
     np.testing.assert_allclose(direction[:2] / direction[2], [x, y], atol=2e-12)
+
+
+@pytest.mark.parametrize("index", range(8))
+def test_each_rational_coefficient_means_what_opencv_says(index):
+    k1, k2, k3, k4, p1, p2, k5, k6 = (0.05 if i == index else 0.0 for i in range(8))
+    x, y = 0.3, -0.45
+    s = x * x + y * y
+    radial = (1 + k1 * s + k2 * s**2 + k3 * s**3) / (1 + k4 * s + k5 * s**2 + k6 * s**3)
+    expected = [x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y]
+    lens = Rational(k1, k2, k3, k4, p1, p2, k5, k6)
+    found = lens.distort(np.array([[2 * x, 2 * y, 2.0]]))
+    np.testing.assert_allclose(found[0], expected, rtol=8 * EPS64)
+    direction = lens.undistort(found)[0]
+    np.testing.assert_allclose(direction[:2] / direction[2], [x, y], atol=2e-12)
+
+
+def test_where_a_rational_lens_turns_back():
+    # r / (1 + s) has its summit, 1 / 2, at r = 1; r / (1 - s) has a pole there and turns nowhere before it
+    assert math.isclose(Rational(k4=1.0).max_angle, math.atan(1.0))
+    assert math.isclose(Rational(k4=-1.0).max_angle, math.atan(1.0))
+    assert Rational(k1=0.1).max_angle == math.pi / 2
+    with pytest.raises(InputError, match="rational lens distortion"):
+        Rational(k4=1.0).undistort(np.array([[0.6, 0.0]]))
+
+
+def test_a_field_of_view_lens_ends_where_its_radius_does():
+    lens = FieldOfView(1.0)
+    np.testing.assert_allclose(lens.distort(np.array([[0.0, 2.0, 2.0]])), [[0.0, math.atan(2 * math.tan(0.5))]])
+    assert not lens.undistort_where(np.array([[math.pi / 2, 0.0]]))[1].any()
+    np.testing.assert_array_equal(FieldOfView(0.0).distort(np.array([[1.0, 2.0, 2.0]])), [[0.5, 1.0]])
+    with pytest.raises(InputError, match="omega must be from 0 to below pi"):
+        FieldOfView(-0.1)
 
 
 def test_fisheye_angles():

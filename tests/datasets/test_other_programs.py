@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from nerfvol.cameras.camera import Camera, look_at
+from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import Fisheye
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
@@ -97,15 +98,16 @@ def test_opencvs_full_model_without_rational_terms(tmp_path):
     assert (
         load_dataset(scene(tmp_path / "a", camera_model="FULL_OPENCV", k1=0.01, k4=0)).cameras[0].intrinsics.k1 == 0.01
     )
-    with pytest.raises(InputError, match="rational terms k4, k5, k6"):
-        load_dataset(scene(tmp_path / "b", camera_model="FULL_OPENCV", k6=0.01))
+    lens = load_dataset(scene(tmp_path / "b", camera_model="FULL_OPENCV", k6=0.01)).cameras[0].intrinsics.lens
+    assert lens == Rational(k6=0.01)
 
 
 @pytest.mark.parametrize(("number", "parameters", "lens"), [
     (14, (30, 12, 8), Fisheye()), (15, (30, 30, 12, 8), Fisheye()),
     (10, (30, 30, 12, 8, 0.01, 0, 0, 0, 0.002, 0, 0, 0), Fisheye(k1=0.01, k3=0.002)),
     (10, (30, 30, 12, 8, 0.01, 0, 0, 0, 0, 0, 0, 0.1), "the term sy1 of THIN_PRISM_FISHEYE"),
-    (7, (30, 30, 12, 8, 0.1), "lens model FOV is not supported"),
+    (6, (30, 30, 12, 8, 0.01, 0, 0, 0, 0, 0.02, 0, 0), Rational(k1=0.01, k4=0.02)),
+    (7, (30, 30, 12, 8, 0.1), FieldOfView(0.1)), (16, (30, 30, 12, 8, 0.1, 0.1), "lens model EUCM is not supported"),
 ])  # fmt: skip
 def test_further_lenses_of_colmap(tmp_path, number, parameters, lens):
     scenes.write_colmap(tmp_path, scenes.ring(), scenes.random_images(), model="PINHOLE")

@@ -81,6 +81,12 @@ def edit(folder, change):
     path.write_text(json.dumps(document))
 
 
+def state(folder, **what):
+    """States more at the top of the document of the training views."""
+    path = folder / "transforms_train.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | what))
+
+
 def turn_over(path):
     Image.open(path).transpose(Image.Transpose.ROTATE_180).save(path)
 
@@ -91,6 +97,8 @@ def turn_over(path):
     (lambda d: edit(d, lambda frames: frames.reverse()), "order"),
     (lambda d: edit(d, lambda frames: frames[3]["transform_matrix"][0].__setitem__(3, 3.3)), "another pose"),
     (lambda d: turn_over(sorted((d / "train").iterdir())[4]), "other pixels"),
+    (lambda d: state(d, aabb=[[-1, -1, -1], [1, 1, 1]]), "the scene's aabb was"),
+    (lambda d: edit(d, lambda frames: frames[3].update(light="noon")), "the lights that they are taken under"),
 ])  # fmt: skip
 def test_a_run_is_resumed_with_its_own_pictures_alone(stopped, tmp_path, tiny_scene, command, change, said):
     """One sentence, whatever became of them, and nothing of the run is touched."""
@@ -100,7 +108,7 @@ def test_a_run_is_resumed_with_its_own_pictures_alone(stopped, tmp_path, tiny_sc
     change(scene)
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     code, _, err = command("train", "--resume", "--out", run, "--data", scene)
-    assert code == 2 and "the pictures are not those that the run was begun with" in err and said in err
+    assert code == 2 and "the data are not those that the run was begun with" in err and said in err
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
 
 

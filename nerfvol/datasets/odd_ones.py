@@ -1,0 +1,79 @@
+"""Views that are nothing like the others of their set: one must not decide for all. They are left out, counted and named."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nerfvol.cameras.focus import crowd_of
+from nerfvol.datasets.images import UInt8
+from nerfvol.datasets.listing import MOST_LOST, are_few, named
+
+if TYPE_CHECKING:
+    from nerfvol.datasets.frames import View
+
+OTHER_LENS = 20
+"""Times: focal lengths, in widths of the picture, that differ by more from the middle one are a mistake and no zoom."""
+
+
+def alone(views: Sequence[View], messages: list[str]) -> set[int]:
+    """The views, by id, whose lens is nothing like the others', or whose pose is that which trackers write where they lost it;
+    sentences on them."""
+    found: set[int] = set()
+    scales = np.array([view.camera.intrinsics.fx / view.camera.intrinsics.width for view in views])
+    apart = (
+        np.maximum(scales, np.median(scales)) / np.minimum(scales, np.median(scales)) > OTHER_LENS if views else scales
+    )
+    odd = [view for view, is_so in zip(views, apart, strict=True) if is_so]
+    if odd and are_few(len(odd), len(views)):
+        found |= {id(view) for view in odd}
+        messages.append(
+            f"the focal lengths of {len(odd)} of {len(views)} images are more than {OTHER_LENS} times as long or short as the "
+            f"others': they are left out: {named([view.frame.listed for view in odd])}"
+        )
+    at_rest = [view for view in views if np.abs(np.abs(view.camera.c2w) - np.eye(4)).max() < 1e-12]
+    told = named([view.frame.listed for view in at_rest])
+    if 1 < len(at_rest) < MOST_LOST * len(views) and len({view.frame.light for view in at_rest}) == 1:
+        found |= {id(view) for view in at_rest}
+        messages.append(
+            f"{len(at_rest)} of {len(views)} images have one pose, the identity, as trackers write that they lost it: they are "
+            f"left out: {told}"
+        )
+    elif len(at_rest) == 1 and len(views) > 1 and at_rest[0] is not views[0]:
+        messages.append(f"the pose of {told} is the identity: was its camera found?")
+    return found
+
+
+def astray(training: Sequence[View], views: Sequence[View]) -> set[int]:
+    """The views whose cameras lie far from all others, by id."""
+    if len(training) < 5:
+        return set()
+    crowd = crowd_of(np.stack([view.camera.position for view in training]))
+    found = set()
+    for group in (training, views):
+        positions = np.stack([view.camera.position for view in group]) if group else np.zeros((0, 3))
+        if len(group):
+            found |= {id(view) for view, far in zip(group, crowd.astray(positions), strict=True) if far}
+    return found
+
+
+def blank(views: Sequence[View], images: Sequence[UInt8], messages: list[str]) -> set[int]:
+    """Indices of the views whose pictures (h, w, 3 or 4) show nothing at all, where few do: one colour throughout, or wholly
+    transparent. A camera that failed would teach that there is nothing. A sentence on them."""
+    found = [i for i, image in enumerate(images) if _is_blank(image)]
+    if not found or not are_few(len(found), len(images)):
+        return set()
+    messages.append(
+        f"{len(found)} of {len(images)} images show nothing, one colour or full transparency throughout, where the others do: "
+        f"they are left out: {named([views[i].frame.listed for i in found])}"
+    )
+    return set(found)
+
+
+def _is_blank(image: UInt8) -> bool:
+    colour = image[0, 0]
+    if image.shape[2] == 4 and not colour[3]:
+        return not image[::8, ::8, 3].any() and not image[..., 3].any()
+    return bool((image[::8, ::8] == colour).all()) and bool((image == colour).all())
