@@ -80,9 +80,9 @@ def pixel_ray(camera, x, y):
 
 
 def picture_rows(trace: Callable) -> Callable:
-    """A function that fills rows first..last - 1 of out (H, W, 5) with the mean of side x side rays per pixel, on a regular grid.
+    """A function that fills rows first..last - 1 of out (H, W, 5) with the mean of side x side rays per pixel.
 
-    ``trace(ray, context)`` gives (rgb, alpha, distance) of a ray.
+    They lie on a regular grid. ``trace(ray, context)`` gives (rgb, alpha, distance) of a ray.
     """
 
     @jit

@@ -48,9 +48,7 @@ class Detail(NamedTuple):
 NONE = Detail(np.zeros(3, np.float32), 1, 1, (1.0, 1.0, 1.0), 0.0, 0, 1.0)
 
 
-def detail(
-    textures: CloudTextures, tiles: object, erosion: float, octaves: int = 1, contrast: float = 1.0
-) -> Detail:
+def detail(textures: CloudTextures, tiles: object, erosion: float, octaves: int = 1, contrast: float = 1.0) -> Detail:
     """Detail of three Worley channels, weights 5 : 2 : 1. tiles: along x, y and z of the box; erosion in [0, 1)."""
     if not 1 <= contrast < math.inf:
         raise InputError(f"cloud: contrast must be from 1 on, got {contrast}")

@@ -90,7 +90,9 @@ def table_of(c: Classified, integrated: bool, gradient: float, shading: str) -> 
     own = pre_integrated(c.points, thickness) if integrated else c.points
     tau = thickness * own[..., :1]
     table = np.concatenate([tau, -np.expm1(-tau), own[..., 1:]], axis=-1)
-    points, pre = (np.zeros((0, 5)), table.astype(np.float32)) if integrated else (table, np.zeros((0, 0, 5), np.float32))
+    points, pre = (
+        (np.zeros((0, 5)), table.astype(np.float32)) if integrated else (table, np.zeros((0, 0, 5), np.float32))
+    )
     return Table(points, pre, gradient / min(c.values.cell), SHADING[shading])
 
 

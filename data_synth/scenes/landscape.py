@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_synth import lights, media, weather
 from data_synth import detail as details
+from data_synth import lights, media, weather
 from data_synth.cameras import Viewpoints
 from data_synth.noise import cloud_textures
 from data_synth.scene import Scene
@@ -14,6 +14,7 @@ from data_synth.scenes.volumes import CLOUD_PHASE
 TILE = 1.6  # u of ground that a tile of the base noise covers
 RIM = 1.2  # a slope so gentle that detail can carve it, and a contrast that makes a crisp body of what is left
 BILLOWS = 3.0  # tiles of detail for one of the base noise
+BAKED = 2  # octaves where the voxels hold them
 EDGE = 0.1  # of the side, over which clouds of noise thin out, so that the box cuts none
 DRY, WET = 0.995, 0.93  # albedo; drops of rain are larger, and absorb more
 
@@ -33,7 +34,7 @@ def cloudscape(
     over = _thinned(weather.generated(coverage, 1.0, seed, t)) if map is None else weather.read(map)
     shape = np.maximum(np.rint((hi - lo) / (hi - lo).max() * resolution).astype(int), 8)
     tiles = (hi - lo) / TILE
-    fine = details.detail(t, BILLOWS * tiles, erosion, max(detail, 1), contrast)
+    fine = details.detail(t, BILLOWS * tiles, erosion, detail or BAKED, contrast)
     rho, wet = weather.landscape(over, tuple(shape), tuple(tiles), seed, details.NONE if detail else fine, t, RIM)
     medium = media.grid(
         rho, lo, hi, density, [(DRY,) * 3, (WET,) * 3], phase=CLOUD_PHASE, attribute=rain * wet,

@@ -64,7 +64,8 @@ def test_contrast_makes_a_crisp_rim_within_its_bounds(textures):
     rng = np.random.default_rng(4)
     shape = np.clip(1.2 * rng.random((10, 10, 10)) - 0.2, 0, 1)
     plain, crisp = (
-        media.grid(shape, (0, 0, 0), (1, 1, 1), detail=detail.detail(textures, (3, 3, 3), 0.8, 2, c)) for c in (1.0, 6.0)
+        media.grid(shape, (0, 0, 0), (1, 1, 1), detail=detail.detail(textures, (3, 3, 3), 0.8, 2, c))
+        for c in (1.0, 6.0)
     )
     where = rng.random((1500, 3))
     rho, brick = densities(crisp, where), np.ravel_multi_index(((where * 9).astype(int) // 8).T, crisp.bricks)

@@ -66,6 +66,16 @@ def test_the_table_has_the_functions_themselves_on_its_diagonal():
     assert np.allclose(pre[..., 0], pre[..., 0].T) and not np.allclose(pre[..., 1], pre[..., 1].T, atol=0.01)
 
 
+def test_mean_opacity_of_a_step_is_the_integral_of_its_function():
+    """Of few nodes, between which the table's own lie: the midpoint rule at 1/4000 of the step."""
+    points = np.random.default_rng(3).random((6, 4))
+    pre = raycast.pre_integrated(points, 0.5)[..., 0]
+    ends = np.linspace(0, 1, raycast.COARSE)
+    for i, j in ((0, 255), (10, 37), (200, 90), (30, 31), (77, 76)):
+        v = ends[i] + (np.arange(4000) + 0.5) / 4000 * (ends[j] - ends[i])
+        assert pre[i, j] == pytest.approx(np.interp(v, np.linspace(0, 1, 6), points[:, 0]).mean(), rel=1e-6)
+
+
 def test_bricks_bound_the_opacity_between_samples():
     """A peak that no sample has is between them: o of the interpolated value, not o of samples interpolated."""
     v = np.random.default_rng(0).choice([0.2, 0.9], (12, 12, 12))
@@ -104,17 +114,20 @@ def test_shading_is_by_the_angle_between_gradient_and_ray(shading):
 
 
 def test_a_step_that_sticks_out_of_the_box_counts_by_what_is_inside():
-    """Opacity 1 everywhere, from any distance: the closed form of the chord, its colour and its mean depth."""
-    c = raycast.classified(np.zeros((9, 9, 9)), (0, 0, 0), (1, 1, 1), np.array([[0, 0.1, 0.2, 0.5, 0.8], [1.0] * 5]), SIGMA)
-    tau = 0.1 * SIGMA
+    """One opacity in three bricks, from any distance: the closed form of the chord, its colour and its mean depth. Steps that
+    reach across two bricks count once."""
+    points = np.array([[0, 0.03, 0.2, 0.5, 0.8], [1.0] * 5])
+    c = raycast.classified(np.zeros((25, 9, 9)), (0, 0, 0), (3, 1, 1), points, SIGMA)
+    sigma = 0.03 * SIGMA
+    alpha = 1 - np.exp(-3 * sigma)
     for integrated in (False, True):
         table = raycast.table_of(c, integrated, 0.0, "none")
         for start in (1.0, 1.03, 1.11, 0.4):
-            L, alpha, far = raycast.cast(((-start, 0.4, 0.5), (1.0, 0.0, 0.0)), (c.values, table))
-            assert alpha == pytest.approx(1 - np.exp(-tau), rel=1e-5)
+            L, opacity, far = raycast.cast(((-start, 0.4, 0.5), (1.0, 0.0, 0.0)), (c.values, table))
+            assert opacity == pytest.approx(alpha, rel=1e-5)
             assert L == pytest.approx(alpha * np.array([0.2, 0.5, 0.8]), rel=1e-5)
-            # the mean of t over the chord, t e^-st; midpoints of 1/8 are off by (0.3 / 8)^2 / 12 and so
-            assert far == pytest.approx(start * alpha + (1 - (1 + tau) * np.exp(-tau)) / tau, rel=2e-2)
+            # the mean of t along the chord; midpoints of 1/8 are off by sigma / 12 of their square
+            assert far == pytest.approx(start * alpha + alpha / sigma - 3 * np.exp(-3 * sigma), rel=2e-3)
 
 
 @pytest.mark.parametrize("integrated", [False, True])
@@ -187,6 +200,7 @@ def test_transfer_functions_in_every_form(tmp_path, name):
     ("a.json", "{"), ("a.json", "3"), ("a.json", '{"points": [{"value": 1}]}'), ("a.json", "[[true, 0, 0, 0, 0]]"),
     ("a.json", '[[0, 0, "1", 0, 0]]'), ("a.csv", "value,opacity\n0,1\n"), ("a.csv", "0,1,1,1,1\n1,1,1,1\n"),
     ("a.txt", "0 0 1 1 1\n1 nan 1 1 1\n"), ("a.txt", "0 0 1 1 1\n1 1e999 1 1 1\n"), ("a.json", "[" * 100_000),
+    ("a.txt", "0 0 1 1 1\n0 1 1 1 1\n"), ("a.txt", "0 0 1 1 1\n1 1.01 1 1 1\n"),
 ])  # fmt: skip
 def test_what_is_no_transfer_function_is_one_sentence(tmp_path, name, text):
     (tmp_path / name).write_text(text)
@@ -195,12 +209,20 @@ def test_what_is_no_transfer_function_is_one_sentence(tmp_path, name, text):
     assert "\n" not in str(said.value) and len(str(said.value)) < 300
 
 
+def test_a_transfer_function_without_end_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "LARGEST", 100)
+    (tmp_path / "t.txt").write_text(TEXT + "# " + 100 * "x")
+    with pytest.raises(InputError, match="at most"):
+        transfer.read(tmp_path / "t.txt")
+
+
 def test_the_window_leaves_out_air_and_metal():
     rng = np.random.default_rng(0)
     body = rng.normal(300, 60, 30_000).clip(1, 900)
     scan = np.concatenate([np.full(70_000, -1000.0), body, np.full(60, 30_000.0)])
     low, high = transfer.window(scan)
     assert -1000 <= low < -800 and 400 < high <= 900
+    assert high == np.quantile(scan[scan > -1000], transfer.TOP, method="inverted_cdf")
     assert transfer.window(np.linspace(0, 1, 5000)) == (0.0, 1.0)  # no air: all of it
     assert transfer.window(np.zeros(10)) == (0.0, 0.0)
 
