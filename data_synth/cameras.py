@@ -8,6 +8,7 @@ unit length, so a ray parameter t is a distance in scene units.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,6 +77,29 @@ def pixel_ray(camera, x, y):
     dz = m[2, 0] * u + m[2, 1] * v - m[2, 2]
     s = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
     return dx * s, dy * s, dz * s
+
+
+def picture_rows(trace: Callable) -> Callable:
+    """A function that fills rows first..last - 1 of out (H, W, 5) with the mean of side x side rays per pixel.
+
+    They lie on a regular grid. ``trace(ray, context)`` gives (rgb, alpha, distance) of a ray.
+    """
+
+    @jit
+    def rows(context, camera, side, out, first, last):
+        o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
+        share = 1.0 / (side * side)
+        for i in range(out.shape[1]):  # columns of a narrow band: rays one after another meet the same bricks
+            for j in range(first, last):
+                r, g, b, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0
+                for s in range(side * side):
+                    ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
+                    L, a, t = trace(ray, context)
+                    r, g, b, alpha, far = r + L[0], g + L[1], b + L[2], alpha + a, far + t
+                out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * share, g * share, b * share
+                out[j, i, 3], out[j, i, 4] = alpha * share, far * share
+
+    return rows
 
 
 def look_at(eye: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0), up: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:

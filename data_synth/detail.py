@@ -1,11 +1,15 @@
 """Detail of clouds below the voxel [Horizon], PHYSICS 13: noise erodes a coarse density at the point where it is asked for.
 
 A grid holds the cloud's shape s(x) in [0, 1]; what a ray meets is
-    rho(x) = remap(s(x), e n(x) -> 1, 0 -> 1) = max(s - e n, 0) / (1 - e n)
-with the erosion e < 1 and the noise n(x) in [0, 1]: tiled Worley noise, looked up where curl noise has pushed it, turned
-upside down from the wispy base to the billowy top. For 0 <= s <= 1
-    (s - e) / (1 - e) <= rho <= s,
-so that the bounds of a brick of the coarse grid are majorants of the eroded density too, with the lower one eroded.
+    rho(x) = min(c remap(s(x), e n(x) -> 1, 0 -> 1), 1) = min(c max(s - e n, 0) / (1 - e n), 1)
+with the erosion e < 1, the contrast c >= 1 and the noise n(x) in [0, 1]: tiled Worley noise, looked up where curl noise has
+pushed it, turned upside down from the wispy base to the billowy top. For 0 <= s <= 1
+    min(c (s - e) / (1 - e), 1) <= rho <= min(c s, 1),
+so that the bounds of a brick of the coarse grid give majorants of the eroded density too, with the lower one eroded.
+
+How far noise moves the cloud's surface is e over the slope of s: a shape that rises slowly from its rim to its middle is
+carved deeply, and the contrast makes of what is left a body with a crisp rim (noise first, threshold afterwards, as clouds of
+real-time graphics do [Schneider 2015, 2017]). A shape that is 1 just behind its rim is hardly changed.
 
 Octave k repeats the noise 4^k times as often with weight 0.4^k; all weights add to 1.
 """
@@ -38,13 +42,16 @@ class Detail(NamedTuple):
     tiles: tuple[float, float, float]
     erosion: float
     octaves: int
+    contrast: float
 
 
-NONE = Detail(np.zeros(3, np.float32), 1, 1, (1.0, 1.0, 1.0), 0.0, 0)
+NONE = Detail(np.zeros(3, np.float32), 1, 1, (1.0, 1.0, 1.0), 0.0, 0, 1.0)
 
 
-def detail(textures: CloudTextures, tiles: object, erosion: float, octaves: int = 1) -> Detail:
+def detail(textures: CloudTextures, tiles: object, erosion: float, octaves: int = 1, contrast: float = 1.0) -> Detail:
     """Detail of three Worley channels, weights 5 : 2 : 1. tiles: along x, y and z of the box; erosion in [0, 1)."""
+    if not 1 <= contrast < math.inf:
+        raise InputError(f"cloud: contrast must be from 1 on, got {contrast}")
     if not 0 <= erosion < 1:
         raise InputError(f"cloud: erosion must be in [0, 1), got {erosion}")
     if not 1 <= octaves <= 8 or octaves != int(octaves):
@@ -52,7 +59,7 @@ def detail(textures: CloudTextures, tiles: object, erosion: float, octaves: int 
     x, y, z = (float(n) for n in vector(tiles, "tiles"))  # pyright: ignore[reportArgumentType]
     noise = textures.detail @ np.array([0.625, 0.25, 0.125], np.float32)
     values = np.concatenate([noise.ravel(), textures.curl.ravel()])
-    return Detail(values, len(noise), len(textures.curl), (x, y, z), float(erosion), int(octaves))
+    return Detail(values, len(noise), len(textures.curl), (x, y, z), float(erosion), int(octaves), float(contrast))
 
 
 def finest(d: Detail) -> tuple[float, float, float]:
@@ -92,11 +99,16 @@ def noise_at(d, x, y, z):
 @jit
 def eroded(d, shape, x, y, z):
     """rho at a point of the unit cube where the coarse shape is ``shape``."""
-    if shape <= 0.0 or d.erosion <= 0.0:
+    if shape <= 0.0 or (d.erosion <= 0.0 and d.contrast == 1.0):
         return shape
-    return remap(shape, d.erosion * noise_at(d, x, y, z), 1.0, 0.0, 1.0)
+    return min(d.contrast * remap(shape, d.erosion * noise_at(d, x, y, z), 1.0, 0.0, 1.0), 1.0)
+
+
+def most(d: Detail, shape: np.ndarray) -> np.ndarray:
+    """An upper bound of the eroded density where the shape is at most ``shape``."""
+    return np.minimum(d.contrast * shape, 1.0)
 
 
 def least(d: Detail, shape: np.ndarray) -> np.ndarray:
     """A lower bound of the eroded density where the shape is at least ``shape``."""
-    return np.maximum(shape - d.erosion, 0.0) / (1.0 - d.erosion)
+    return most(d, np.maximum(shape - d.erosion, 0.0) / (1.0 - d.erosion))

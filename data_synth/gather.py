@@ -21,7 +21,7 @@ import numpy as np
 
 from data_synth import media, sweep
 from data_synth import phase as phases
-from data_synth.cameras import pixel_ray
+from data_synth.cameras import picture_rows
 from data_synth.fields import at_sample
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
@@ -165,18 +165,18 @@ def mix(f, a, b):
 
 @jit
 def place(m, p):
-    """(first number, three fractions) of the cell around a point of a stored brick, given in cells."""
+    """(first sample, three fractions) of the cell around a point of a stored brick, given in cells."""
     n = m.cells
     i = min(max(int(p[0]), 0), n[0] - 1)
     j = min(max(int(p[1]), 0), n[1] - 1)
     k = min(max(int(p[2]), 0), n[2] - 1)
     first = m.offsets[np.uintp(((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3))]
     a = first + ((i & 7) * SIDE + (j & 7)) * SIDE + (k & 7)
-    return np.uintp(4 * a), np.float32(p[0] - i), np.float32(p[1] - j), np.float32(p[2] - k)
+    return a, p[0] - i, p[1] - j, p[2] - k
 
 
 @jit
-def trilinear(v, a, fu, fv, fw):
+def four_mixed(v, a, fu, fv, fw):
     """The numbers of the eight samples around a cell, mixed."""
     z, y, x = np.uintp(4), np.uintp(4 * SIDE), np.uintp(4 * SIDE * SIDE)
     b = a + x
@@ -186,10 +186,10 @@ def trilinear(v, a, fu, fv, fw):
 
 
 @jit
-def look_up(m, v, p):
+def look_up(m, numbers, p):
     """(rho, J rgb) at a point: ``lookups.interpolated`` of four numbers at a time."""
-    a, fu, fv, fw = place(m, p)
-    return trilinear(v, a, fu, fv, fw)
+    a, u, v, w = place(m, p)
+    return four_mixed(numbers, np.uintp(4 * a), np.float32(u), np.float32(v), np.float32(w))
 
 
 class Clear(NamedTuple):
@@ -217,25 +217,30 @@ _march = traversal(steps(gathered_event))
 
 
 @jit
+def in_cells(m, ray):
+    """A ray as it is seen from the lowest corner of the medium, with its cells for units; t stays what it was."""
+    o, d, cell = sub(ray[0], m.lo), ray[1], m.cell
+    return (o[0] / cell[0], o[1] / cell[1], o[2] / cell[2]), (d[0] / cell[0], d[1] / cell[1], d[2] / cell[2])
+
+
+@jit
 def march_gathered(m, rho_J, ray, t0, t1, base, state):
     """Fold [t0, t1] of a ray through the medium into a state (``Clear``)."""
-    o, d, cell = sub(ray[0], m.lo), ray[1], m.cell
-    in_cells = ((o[0] / cell[0], o[1] / cell[1], o[2] / cell[2]), (d[0] / cell[0], d[1] / cell[1], d[2] / cell[2]))
-    return _march(m, ray, t0, t1, True, state, (rho_J, in_cells, base))[0]
+    return _march(m, ray, t0, t1, True, state, (rho_J, in_cells(m, ray), base))[0]
+
+
+@jit
+def _seen(ray, context):
+    m, rho_J = context
+    t0, t1 = box_interval(ray, m.lo, m.hi)
+    x = march_gathered(m, rho_J, ray, t0, t1, 0.0, Clear((0.0, 0.0, 0.0), 1.0, 0.0))
+    return x.L, 1.0 - x.T, x.far
+
+
+_rows = picture_rows(_seen)
 
 
 @kernel
 def render_rows(m, rho_J, camera, side, out, first, last):
     """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance of a medium that stands alone."""
-    o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
-    share = 1.0 / (side * side)
-    for j in range(first, last):
-        for i in range(out.shape[1]):
-            r, g, b, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0
-            for s in range(side * side):
-                ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
-                t0, t1 = box_interval(ray, m.lo, m.hi)
-                x = march_gathered(m, rho_J, ray, t0, t1, 0.0, Clear((0.0, 0.0, 0.0), 1.0, 0.0))
-                r, g, b, alpha, far = r + x.L[0], g + x.L[1], b + x.L[2], alpha + 1.0 - x.T, far + x.far
-            out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * share, g * share, b * share
-            out[j, i, 3], out[j, i, 4] = alpha * share, far * share
+    _rows((m, rho_J), camera, side, out, first, last)

@@ -37,6 +37,8 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # compiling takes. To call one from Python say function.py_func(...).
 INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 jit = numba.njit(**INNER)
+# For what is called at every step: a call that is not inlined hands over every number and array of a medium, one by one.
+inlined = numba.njit(forceinline=True, **INNER)
 
 
 def plain(function: Callable) -> Callable:

@@ -160,7 +160,11 @@ def _detailed(m: Medium, d: details.Detail) -> Medium:
     if m.max_density > 1:
         raise InputError(f"medium: a density with detail must be in [0, 1], got {m.max_density:g}")
     sizes = [2 * (b - a) / n for a, b, n in zip(m.lo, m.hi, details.finest(d), strict=True)]
-    return m._replace(detail=d, brick_min=details.least(d, m.brick_min), step=min(m.step, max(min(sizes), m.step / 8)))
+    top = details.most(d, m.brick_max)
+    return m._replace(
+        detail=d, brick_max=top, max_density=float(top.max()), brick_min=details.least(d, m.brick_min),
+        step=min(m.step, max(min(sizes), m.step / 8)),
+    )  # fmt: skip
 
 
 def _varying(phase: phases.Phase | None, g: bool, S: bool) -> phases.Phase | None:

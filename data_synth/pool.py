@@ -43,7 +43,7 @@ def pool(media: Sequence[Medium]) -> Media:
         row = [m.kind, *m.lo, *m.hi, *m.cells, *m.bricks, *m.cell, m.max_density, *m.sigma_t, m.base, m.falloff, m.step]
         row += [m.flake_area, m.phase.kind, m.phase.g1, m.phase.g2, m.phase.mix, *m.columns, m.function]
         row += [*m.detail.tiles, m.detail.erosion, m.detail.octaves, m.detail.n, m.detail.p]
-        row += [m.phase.micro, m.phase.roughness, m.phase.ior, *m.phase.table[1:]]
+        row += [m.phase.micro, m.phase.roughness, m.phase.ior, *m.phase.table[1:], m.detail.contrast]
         numbers[k, : len(row)] = row
         first[k + 1] = first[k] + [len(array) for array in _arrays(m)]
     empty = [np.zeros(0, np.int64), np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0), np.zeros(0)]
@@ -97,5 +97,5 @@ def medium_at(media, k):
         Columns(int(n[28]), int(n[29]), int(n[30]), int(n[31]), int(n[32]), int(n[33]), int(n[34])),
         int(n[35]),
         media.faults[a[8] : b[8]],
-        Detail(media.detail[a[10] : b[10]], int(n[41]), int(n[42]), (n[36], n[37], n[38]), n[39], int(n[40])),
+        Detail(media.detail[a[10] : b[10]], int(n[41]), int(n[42]), (n[36], n[37], n[38]), n[39], int(n[40]), n[49]),
     )

@@ -19,20 +19,21 @@ from typing import NamedTuple
 import numpy as np
 
 from data_synth import media
-from data_synth.cameras import pixel_ray
+from data_synth.cameras import picture_rows
 from data_synth.errors import InputError
-from data_synth.gather import OPAQUE
-from data_synth.jit import jit, kernel
-from data_synth.lookups import box_interval, interpolated
-from data_synth.media import Medium, Point
-from data_synth.traverse import steps, traversal
-from data_synth.vec import along, dot, scale
+from data_synth.gather import in_cells
+from data_synth.jit import inlined, jit, kernel
+from data_synth.lookups import box_interval
+from data_synth.media import SIDE, Medium, Point
+from data_synth.traverse import lattice, traversal
+from data_synth.vec import along, bilinear, dot, scale, trilinear
 
 UNSHADED, LAMBERT, PHONG = range(3)
 SHADING = {"none": UNSHADED, "lambert": LAMBERT, "phong": PHONG}
 FINE, COARSE = 1024, 256  # nodes of the functions of v, and of the table along each side
 AMBIENT, DIFFUSE, SPECULAR, EXPONENT = 0.25, 0.75, 0.3, 30.0
 SHIFT = 1.0  # stored values are above 0, so that all bricks are there
+OPAQUE = 1.0 / 512.0  # a ray whose transmittance falls below this stops: half of what 8 bits can tell
 
 
 class Classified(NamedTuple):
@@ -44,12 +45,12 @@ class Classified(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What the kernel reads. points: (FINE, 4), or (0, 4) for pre: (COARSE, COARSE, 4) over front and back; gradient: of v
-    per u at which opacity is full, 0 for none; shading: one of the above."""
+    """What the kernel reads. points: (FINE, 5), or pre: (COARSE, COARSE, 5) over front and back, the other one empty: optical
+    thickness and opacity of a step, r, g, b; gradient: of v per u at which opacity is full, 0 for none; shading: one of the
+    above."""
 
     points: np.ndarray
     pre: np.ndarray
-    sigma: float
     gradient: float
     shading: int
 
@@ -85,8 +86,14 @@ def check(gradient: float, shading: str) -> None:
 
 def table_of(c: Classified, integrated: bool, gradient: float, shading: str) -> Table:
     """gradient: change of v from one voxel to the next at which opacity is full."""
-    pre = pre_integrated(c.points, c.sigma * c.values.step) if integrated else np.zeros((0, 0, 4))
-    return Table(c.points, pre, c.sigma, gradient / min(c.values.cell), SHADING[shading])
+    thickness = c.sigma * c.values.step
+    own = pre_integrated(c.points, thickness) if integrated else c.points
+    tau = thickness * own[..., :1]
+    table = np.concatenate([tau, -np.expm1(-tau), own[..., 1:]], axis=-1)
+    points, pre = (
+        (np.zeros((0, 5)), table.astype(np.float32)) if integrated else (table, np.zeros((0, 0, 5), np.float32))
+    )
+    return Table(points, pre, gradient / min(c.values.cell), SHADING[shading])
 
 
 def pre_integrated(points: np.ndarray, thickness: float, inside: int = 64) -> np.ndarray:
@@ -121,57 +128,54 @@ def pre_integrated(points: np.ndarray, thickness: float, inside: int = 64) -> np
     return np.concatenate([np.maximum(opacity, 0.0)[..., None], colour], axis=-1)
 
 
-@jit
+@inlined
 def value(m, p):
-    """v at a point, which may lie a little outside of the box."""
-    q = (
-        min(max(p[0], m.lo[0]), m.hi[0]),
-        min(max(p[1], m.lo[1]), m.hi[1]),
-        min(max(p[2], m.lo[2]), m.hi[2]),
-    )
-    return interpolated(m, m.samples, q) - 1.0
+    """v at a point that is given in cells from the lowest corner; outside of the box as at its nearest point."""
+    n = m.cells
+    x, y, z = min(max(p[0], 0.0), n[0]), min(max(p[1], 0.0), n[1]), min(max(p[2], 0.0), n[2])
+    i, j, k = min(int(x), n[0] - 1), min(int(y), n[1] - 1), min(int(z), n[2] - 1)
+    brick = m.offsets[np.uintp(((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3))]
+    a = np.uintp(brick + ((i & 7) * SIDE + (j & 7)) * SIDE + (k & 7))
+    one, row, plane = np.uintp(1), np.uintp(SIDE), np.uintp(SIDE * SIDE)
+    v, b = m.samples, a + plane
+    near = (v[a], v[a + one], v[a + row], v[a + row + one])
+    far = (v[b], v[b + one], v[b + row], v[b + row + one])
+    return trilinear(near + far, x - i, y - j, z - k) - SHIFT  # noqa: RUF005
 
 
 @jit
 def gradient_at(m, p):
-    """Of v, per u: central differences over a cell to each side."""
-    hx, hy, hz = m.cell
+    """Of v, per u, at a point in cells: central differences over a cell to each side."""
+    x, y, z = p
     return (
-        (value(m, (p[0] + hx, p[1], p[2])) - value(m, (p[0] - hx, p[1], p[2]))) / (2.0 * hx),
-        (value(m, (p[0], p[1] + hy, p[2])) - value(m, (p[0], p[1] - hy, p[2]))) / (2.0 * hy),
-        (value(m, (p[0], p[1], p[2] + hz)) - value(m, (p[0], p[1], p[2] - hz))) / (2.0 * hz),
+        (value(m, (x + 1.0, y, z)) - value(m, (x - 1.0, y, z))) / (2.0 * m.cell[0]),
+        (value(m, (x, y + 1.0, z)) - value(m, (x, y - 1.0, z))) / (2.0 * m.cell[1]),
+        (value(m, (x, y, z + 1.0)) - value(m, (x, y, z - 1.0))) / (2.0 * m.cell[2]),
     )
 
 
-@jit
-def at_value(points, v):
-    """(opacity, r, g, b) of a value."""
+@inlined
+def at_value(points, v, c):
+    """Column c of the function of a value, linear in between."""
     n = points.shape[0]
     x = min(max(v, 0.0), 1.0) * (n - 1)
     i = min(int(x), n - 2)
-    f = x - i
-    return (
-        points[i, 0] + f * (points[i + 1, 0] - points[i, 0]),
-        points[i, 1] + f * (points[i + 1, 1] - points[i, 1]),
-        points[i, 2] + f * (points[i + 1, 2] - points[i, 2]),
-        points[i, 3] + f * (points[i + 1, 3] - points[i, 3]),
-    )
+    return points[i, c] + (x - i) * (points[i + 1, c] - points[i, c])
 
 
-@jit
-def between(pre, front, back):
-    """(opacity, r, g, b) of a step from one value to another, bilinear in the table."""
+@inlined
+def between(pre, front, back, c):
+    """Column c of a step from one value to another, bilinear in the table."""
     n = pre.shape[0]
     x, y = min(max(front, 0.0), 1.0) * (n - 1), min(max(back, 0.0), 1.0) * (n - 1)
     i, j = min(int(x), n - 2), min(int(y), n - 2)
-    u, v = x - i, y - j
-    a, b, c, d = (1.0 - u) * (1.0 - v), (1.0 - u) * v, u * (1.0 - v), u * v
-    return (
-        a * pre[i, j, 0] + b * pre[i, j + 1, 0] + c * pre[i + 1, j, 0] + d * pre[i + 1, j + 1, 0],
-        a * pre[i, j, 1] + b * pre[i, j + 1, 1] + c * pre[i + 1, j, 1] + d * pre[i + 1, j + 1, 1],
-        a * pre[i, j, 2] + b * pre[i, j + 1, 2] + c * pre[i + 1, j, 2] + d * pre[i + 1, j + 1, 2],
-        a * pre[i, j, 3] + b * pre[i, j + 1, 3] + c * pre[i + 1, j, 3] + d * pre[i + 1, j + 1, 3],
-    )
+    return bilinear(pre[i, j, c], pre[i, j + 1, c], pre[i + 1, j, c], pre[i + 1, j + 1, c], x - i, y - j)
+
+
+@inlined
+def of_step(table, front, back, c):
+    """Column c of the table for a step; front and back are the value at its midpoint where nothing is integrated."""
+    return between(table.pre, front, back, c) if table.pre.shape[0] > 0 else at_value(table.points, front, c)
 
 
 @jit
@@ -185,49 +189,55 @@ def shaded(colour, gradient, length, d, shading):
     return (light * colour[0] + gloss, light * colour[1] + gloss, light * colour[2] + gloss)
 
 
-@jit
-def step_event(m, ray, t, width, state, table):
-    """One step: opacity and colour between its ends, or at its midpoint."""
-    p, back = along(ray, t), state.v
+@inlined
+def step_event(m, ray, t, width, state, context):
+    """One step, or what of it is in the box: opacity and colour between its ends, or at its midpoint."""
+    table, cells, t0, t1 = context
+    start, end = max(t - 0.5 * width, t0), min(t + 0.5 * width, t1)
+    if end <= start:
+        return state, False
     if table.pre.shape[0] > 0:
-        start, end = t - 0.5 * width, t + 0.5 * width
-        front = state.v if abs(state.t - start) < 1e-9 * (1.0 + start) else value(m, along(ray, start))
-        back = value(m, along(ray, end))
-        opacity, r, g, b = between(table.pre, front, back)
+        front = state.v if abs(state.t - start) < 1e-9 * (1.0 + start) else value(m, along(cells, start))
+        back = value(m, along(cells, end))
         state = Ray(state.L, state.T, state.far, end, back)
     else:
-        opacity, r, g, b = at_value(table.points, value(m, p))
+        front = back = value(m, along(cells, 0.5 * (start + end)))
+    opacity = of_step(table, front, back, 1)
     if opacity <= 0.0:
         return state, False
-    colour = (r, g, b)
+    colour = (of_step(table, front, back, 2), of_step(table, front, back, 3), of_step(table, front, back, 4))
+    part = (end - start) / width
     if table.gradient > 0.0 or table.shading != UNSHADED:
-        gradient = gradient_at(m, p)
+        gradient = gradient_at(m, along(cells, 0.5 * (start + end)))
         length = math.sqrt(dot(gradient, gradient))
         if table.gradient > 0.0:
-            opacity *= min(length / table.gradient, 1.0)
+            part *= min(length / table.gradient, 1.0)
         colour = shaded(colour, gradient, length, ray[1], table.shading)
-    weight = -state.T * math.expm1(-table.sigma * opacity * width)
-    c = scale(weight, colour)
-    T, L = state.T - weight, (state.L[0] + c[0], state.L[1] + c[1], state.L[2] + c[2])
-    return Ray(L, T, state.far + weight * t, state.t, state.v), T < OPAQUE
+    if part < 1.0 - 1e-9:
+        opacity = -math.expm1(-part * of_step(table, front, back, 0))
+    weight = state.T * opacity
+    c, T = scale(weight, colour), state.T - weight
+    L = (state.L[0] + c[0], state.L[1] + c[1], state.L[2] + c[2])
+    return Ray(L, T, state.far + weight * 0.5 * (start + end), state.t, state.v), T < OPAQUE
 
 
-cast = traversal(steps(step_event))
+_cast = traversal(lattice(step_event))
+
+
+@jit
+def cast(ray, context):
+    """(L, alpha, distance) of a ray. context: the medium of the values, and the table."""
+    m, table = context
+    t0, t1 = box_interval(ray, m.lo, m.hi)
+    nothing = Ray((0.0, 0.0, 0.0), 1.0, 0.0, -1.0, 0.0)
+    seen, _ = _cast(m, ray, t0, t1, True, nothing, (table, in_cells(m, ray), t0, t1))
+    return seen.L, 1.0 - seen.T, seen.far
+
+
+_rows = picture_rows(cast)
 
 
 @kernel
 def render_rows(m, table, camera, side, out, first, last):
     """Rows first..last - 1 of out (H, W, 5) = rgb, alpha, distance; side x side rays per pixel."""
-    o = (camera.c2w[0, 3], camera.c2w[1, 3], camera.c2w[2, 3])
-    share = 1.0 / (side * side)
-    for j in range(first, last):
-        for i in range(out.shape[1]):
-            r, g, b, alpha, far = 0.0, 0.0, 0.0, 0.0, 0.0
-            for s in range(side * side):
-                ray = (o, pixel_ray(camera, i + (s % side + 0.5) / side, j + (s // side + 0.5) / side))
-                t0, t1 = box_interval(ray, m.lo, m.hi)
-                seen, _ = cast(m, ray, t0, t1, True, Ray((0.0, 0.0, 0.0), 1.0, 0.0, -1.0, 0.0), table)
-                r, g, b, far = r + seen.L[0], g + seen.L[1], b + seen.L[2], far + seen.far
-                alpha += 1.0 - seen.T
-            out[j, i, 0], out[j, i, 1], out[j, i, 2] = r * share, g * share, b * share
-            out[j, i, 3], out[j, i, 4] = alpha * share, far * share
+    _rows((m, table), camera, side, out, first, last)

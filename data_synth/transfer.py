@@ -30,6 +30,8 @@ def read(path: str | os.PathLike) -> np.ndarray:
         text = path.read_text("utf-8")
         rows = _json(text) if path.suffix == ".json" else _lines(text)
         points = np.array(rows, float)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:

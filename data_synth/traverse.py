@@ -3,6 +3,7 @@
 ``traversal(stepper)`` makes a function that cuts a ray into the bricks it crosses, front to back, and skips the empty
 ones. A *stepper* walks one such piece with known density bounds and calls an *event* at points on it:
     steps(event)       midpoints of equal steps                             width = the step
+    lattice(event)     midpoints of steps counted from the ray's origin     width = the step
     cells(event)       each grid cell once                                  width = the chord of the cell
     collisions(event)  tentative collisions of a majorant (Woodcock 1965)   width = 1 / majorant
 An event is ``event(m, ray, t, width, state, context) -> (state, stop)``, with the state a number or tuple that it
@@ -89,6 +90,25 @@ def steps(event: Callable) -> Callable:
             if stop:
                 return carry, state, True
         return carry, state, False
+
+    return stepper
+
+
+def lattice(event: Callable) -> Callable:
+    """Midpoints of steps m.step long, counted from t = 0 whatever the bricks are: those that reach into a piece, each once.
+
+    The first and the last of them may stick out of [t0, t1].
+    """
+
+    @jit
+    def stepper(m, ray, a, b, brick, carry, state, context):
+        k = max(carry, math.floor(a / m.step))
+        while k * m.step < b:
+            state, stop = event(m, ray, (k + 0.5) * m.step, m.step, state, context)
+            k += 1.0
+            if stop:
+                return k, state, True
+        return k, state, False
 
     return stepper
 

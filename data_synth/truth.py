@@ -10,7 +10,8 @@
 | ``mediumK_micro``, ``_roughness``,     | of other microflakes: ``microflakes.py``; D: (n, rows + 1, columns) normals  |
 | ``_ior``, ``_D``                        | at polar angles 0 ... pi/2 and azimuths 0 ... 2 pi; none: S                  |
 | ``mediumK_noise``, ``_curl``, ``_tiles``| of a cloud with detail below its grid, as ``detail.py`` erodes the density;  |
-| ``mediumK_erosion``, ``_octaves``       | z from lo to hi is its height in [0, 1]                                      |
+| ``mediumK_erosion``, ``_octaves``,      | z from lo to hi is its height in [0, 1]                                      |
+| ``_contrast``                           |                                                                             |
 | ... of kind rgb_grid                    | density and albedo are (nx, ny, nz, 3): extinction in 1/u, and albedo       |
 | ... above 2^28 samples                  | no dense arrays: ``_cells``, ``_offsets`` (first sample of each brick of 8^3 |
 |                                         | cells, -1: empty), ``_samples``, ``_attributes``, ``_fields``, ``_columns`` |
@@ -107,7 +108,7 @@ def _detail(d: Detail) -> dict[str, object]:
     size = d.n**3
     return {
         "noise": d.values[:size].reshape((d.n,) * 3), "curl": d.values[size:].reshape(d.p, d.p, 2), "tiles": d.tiles,
-        "erosion": d.erosion, "octaves": d.octaves,
+        "erosion": d.erosion, "octaves": d.octaves, "contrast": d.contrast,
     }  # fmt: skip
 
 

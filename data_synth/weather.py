@@ -72,7 +72,7 @@ def mixed_gradient(kind, h):
 
 
 @kernel
-def _fill(t, detail, weather, tiles, cloud, rain, first, last):
+def _fill(t, detail, weather, rim, tiles, cloud, rain, first, last):
     nx, ny, nz = cloud.shape
     for i in range(first, last):
         for j in range(ny):
@@ -80,18 +80,19 @@ def _fill(t, detail, weather, tiles, cloud, rain, first, last):
             cover, kind, wet = weather_at(weather, x, y, 0), weather_at(weather, x, y, 1), weather_at(weather, x, y, 2)
             for k in range(nz):
                 z = k / (nz - 1)
-                shape = shape_at(t, mixed_gradient(kind, z), cover, RIM, tiles[0] * x, tiles[1] * y, tiles[2] * z)
+                shape = shape_at(t, mixed_gradient(kind, z), cover, rim, tiles[0] * x, tiles[1] * y, tiles[2] * z)
                 cloud[i, j, k] = eroded(detail, shape, x, y, z)
                 rain[i, j, k] = wet * remap(z, 0.15, 0.75, 1.0, 0.0)
 
 
 def landscape(
     weather: np.ndarray, shape: Sequence[int], tiles: Sequence[float] = (1.0, 1.0, 1.0), seed: int = 0,
-    detail: Detail = NONE, textures: CloudTextures | None = None,
+    detail: Detail = NONE, textures: CloudTextures | None = None, rim: float = RIM,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """((nx, ny, nz) float32 clouds, the same of rain), both in [0, 1], for ``media.grid(clouds, ..., attribute=rain)``.
 
     tiles: of the base noise along x, y and z. detail: erodes them at the samples; without it, as here, hand it to the medium.
+    rim: how far from a cloud's edge, in the base noise, its shape is 1; what detail is to carve wants a wide one.
     """
     weather = np.ascontiguousarray(weather, np.float32)
     if weather.ndim != 3 or weather.shape[2] != 3 or min(weather.shape[:2]) < 2:
@@ -103,5 +104,5 @@ def landscape(
     cloud, rain = np.empty(tuple(shape), np.float32), np.empty(tuple(shape), np.float32)
     x, y, z = (float(n) for n in tiles)
     t = textures or cloud_textures(seed)
-    in_bands(lambda a, b: _fill(t, detail, weather, (x, y, z), cloud, rain, a, b), cloud.shape[0], 4)
+    in_bands(lambda a, b: _fill(t, detail, weather, float(rim), (x, y, z), cloud, rain, a, b), cloud.shape[0], 4)
     return cloud, rain

@@ -59,6 +59,25 @@ def test_a_lower_bound_above_zero_is_eroded_too(textures):
     assert m.brick_min[0] == pytest.approx(0.5) and m.brick_min[0] <= rho.min() < rho.max() <= m.brick_max[0]
 
 
+def test_contrast_makes_a_crisp_rim_within_its_bounds(textures):
+    """min(c rho, 1) of the same erosion without contrast; bounds of bricks and the pool of media know of it."""
+    rng = np.random.default_rng(4)
+    shape = np.clip(1.2 * rng.random((10, 10, 10)) - 0.2, 0, 1)
+    plain, crisp = (
+        media.grid(shape, (0, 0, 0), (1, 1, 1), detail=detail.detail(textures, (3, 3, 3), 0.8, 2, c))
+        for c in (1.0, 6.0)
+    )
+    where = rng.random((1500, 3))
+    rho, brick = densities(crisp, where), np.ravel_multi_index(((where * 9).astype(int) // 8).T, crisp.bricks)
+    assert np.allclose(rho, np.minimum(6.0 * densities(plain, where), 1.0))
+    assert (rho <= crisp.brick_max[brick]).all() and (rho >= crisp.brick_min[brick]).all() and rho.max() == 1.0
+    assert crisp.max_density == crisp.brick_max.max() == 1.0
+    air = media.homogeneous((0, 0, 0), (1, 1, 1))
+    assert np.array_equal(densities(pool.medium_at(pool.pool([air, crisp]), 1), where), rho)
+    with pytest.raises(InputError, match="contrast"):
+        detail.detail(textures, (1, 1, 1), 0.3, contrast=0.5)
+
+
 @pytest.mark.parametrize("method", [trackers.DELTA, trackers.RATIO, trackers.RESIDUAL])
 def test_trackers_are_unbiased_below_the_voxel(medium, method):
     """Against the midpoint rule at 1/40 of a cell. A majorant that is none would bias them."""

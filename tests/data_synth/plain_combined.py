@@ -48,7 +48,7 @@ WHITE = {"albedo": np.ones((N,) * 3)}
 def textures():
     rng = np.random.default_rng(3)
     base, fine = (np.kron(rng.random((4, 4, 4, c)), np.ones((2, 2, 2, 1))).astype(np.float32) for c in (4, 3))
-    return noise.CloudTextures(base, fine, noise.curl_texture(8, 0))
+    return noise.CloudTextures(base, fine, noise.curl_texture(6, 0))
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +103,7 @@ def test_a_medium_of_many_keeps_all_that_it_has(fine):
         medium(fine, S=FIBRES, phase=phase.microflakes(np.eye(3), micro="refractive", ior=1.3), **WARM),
         media.procedural(wave, *BOX, np.ones((1, 2, 3)), Le=0.5, phase=table),
         media.grid(DENSITY, *BOX, g=BEND, attribute=DENSITY), medium(fine, phase=table, albedo=ALBEDO),
+        media.exponential(*BOX, 0.7, (1.0, 2.0, 3.0), 0.5, phase=phase.two_lobes(0.7, -0.4, 0.3)),
     ]  # fmt: skip
     together = pool.pool(many)
 

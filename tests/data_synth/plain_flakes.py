@@ -45,6 +45,9 @@ TABLES = {
 }
 
 
+SECOND = {name: microflakes.together([TABLES["facing"], TABLES[name]]) for name in ("Beckmann", "fibre")}
+
+
 def normals(name):
     return Normals(spongecake.FLAKES, TABLES[name], 0)
 
@@ -92,9 +95,20 @@ def test_a_tabulated_sggx_is_sggx():
     assert microflakes.projected_area(ggx, WI) == pytest.approx(microflakes.projected_area(surface, WI), rel=3e-3)
 
 
+def test_opposite_normals_are_one_flake_whatever_the_values_say():
+    values = np.random.default_rng(0).random((5, 8))
+    n = Normals(spongecake.FLAKES, microflakes.tabulated(values), 0)
+    for m in (unit(np.cos(0.3), np.sin(0.3), 0.0), unit(0.2, -0.7, 0.4), unit(-1, 0.1, 1e-9)):
+        back = tuple(-x for x in m)
+        assert microflakes.normal_density(n, m) == pytest.approx(microflakes.normal_density(n, back), rel=1e-6)
+        assert microflakes.projected_area(n, m) == pytest.approx(microflakes.projected_area(n, back), rel=1e-6)
+    pole = [microflakes.normal_density(n, unit(1e-9 * np.cos(a), 1e-9 * np.sin(a), 1.0)) for a in range(6)]
+    assert np.ptp(pole) < 1e-6
+
+
 @pytest.mark.parametrize("name", ["Beckmann", "fibre"])
 def test_visible_normals_and_mirrored_directions_follow_their_densities(name):
-    n, ph, count = normals(name), phase.microflakes(TABLES[name]), 1500
+    n, ph, count = Normals(spongecake.FLAKES, SECOND[name], 1), phase.microflakes(TABLES[name]), 1500
     grid, rng = SphereGrid(8, 6, 3), new_rng(1, 0)
     D = np.array([microflakes.normal_density(n, tuple(m)) for m in grid.directions])
     seen = grid.per_bin(np.maximum(grid.directions @ np.array(WO), 0) * D)
@@ -209,8 +223,9 @@ def test_a_medium_of_many_keeps_its_flakes():
     assert m.flake_area == m.phase.table.sigma.max()
 
 
+FACING = microflakes.beckmann((0, 0, 1), 0.5, 32)
 CAKES = {
-    "Beckmann, glass": spongecake.layer(0.6, microflakes.beckmann((0, 0, 1), 0.5, 32), 1.0, eta=1.5),
+    "Beckmann, glass": spongecake.layer(0.6, FACING, 1.0, eta=1.5),
     "fibre, gold": spongecake.layer(0.9, TABLES["fibre"], 1.0, eta=(0.2, 0.4, 1.4), k=(3.4, 2.4, 1.9)),
     "SGGX, Schlick": spongecake.layer(0.4, sggx.fibre(unit(1, 0.3, 0.1), 0.5), (0.6, 0.3, 0.1), schlick=True),
 }
@@ -224,9 +239,9 @@ def test_layers_agree_with_an_integral_over_depth(wi):
     want, h = np.zeros(3), unit(*(np.array(wo) + wi))
     cosine = float(np.dot(h, wo))
     taus = layers.rows[:, 0]
-    slants = np.array(
-        [[microflakes.projected_area(spongecake.flakes(layers, k), w) / abs(w[2]) for w in (wo, wi)] for k in range(3)]
-    )
+    flakes = [Normals(spongecake.FLAKES, table, 0) for table in (FACING, TABLES["fibre"])]
+    flakes.append(Normals(tuple(sggx.fibre(unit(1, 0.3, 0.1), 0.5)), microflakes.EMPTY, -1))
+    slants = np.array([[microflakes.projected_area(s, w) / abs(w[2]) for w in (wo, wi)] for s in flakes])
     F = (
         [fresnel.reflectance(cosine, 1.5, 0.0)] * 3,
         [fresnel.reflectance(cosine, eta, k) for eta, k in ((0.2, 3.4), (0.4, 2.4), (1.4, 1.9))],
@@ -239,21 +254,31 @@ def test_layers_agree_with_an_integral_over_depth(wi):
             others = slice(0, k) if w[2] > 0 else slice(k + 1, 3)
             within = t if w[2] > 0 else taus[k] - t
             legs = legs * np.exp(-taus[others] @ slants[others, leg]) * np.exp(-within * slants[k, leg])
-        D = microflakes.normal_density(spongecake.flakes(layers, k), h)
+        D = microflakes.normal_density(flakes[k], h)
         want += np.array(F[k]) * D / (4 * abs(wo[2] * wi[2])) * legs.mean() * taus[k]
     got = spongecake.evaluate(layers, 0, 3, wo, wi)
     assert got == pytest.approx(want, rel=1e-6) and min(got) > 0 and len(set(got)) == 3
     assert spongecake.evaluate(layers, 0, 3, wi, wo) == pytest.approx(got, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", CAKES)
-def test_layers_of_any_flakes_are_sampled_by_their_pdf(name):
-    layers, wo, count, rng = spongecake.stack([CAKES[name]]), unit(0.4, -0.2, 0.7), 1500, new_rng(4, 0)
-    grid = SphereGrid(8, 8, 4)
-    expected = grid.per_bin(np.array([spongecake.pdf(layers, 0, 1, wo, tuple(w)) for w in grid.directions]))
-    drawn = [spongecake.sample(layers, 0, 1, wo, rng) for _ in range(count)]
+@pytest.mark.parametrize(("lo", "gap"), [(1.3, 0.0), (0.2, 1e-7), (2.0, 1e-5)])
+def test_transmission_where_the_slants_meet(lo, gap):
+    """Two points of Gauss's rule over the depth are exact to (tau gap)^4."""
+    tau, t = 0.7, 0.5 + 0.5 / np.sqrt(3) * np.array([-1.0, 1.0])
+    want = tau * np.mean(np.exp(-tau * (t * lo + (1 - t) * (lo + gap))))
+    assert spongecake.depth_integral(tau, lo, lo + gap, False) == pytest.approx(want, rel=1e-9)
+
+
+@pytest.mark.parametrize(("names", "side"), [*((name, 1.0) for name in CAKES), (None, 1.0), (None, -1.0)])
+def test_layers_of_any_flakes_are_sampled_by_their_pdf(names, side):
+    """Each alone, and all three from above and below."""
+    cakes = [CAKES[name] for name in ([names] if names else CAKES)]
+    layers, wo, count, rng = spongecake.stack(cakes), unit(0.4, -0.2, 0.7 * side), 1500, new_rng(4, 0)
+    grid, n = SphereGrid(8, 8, 4 if names else 3), len(cakes)
+    expected = grid.per_bin(np.array([spongecake.pdf(layers, 0, n, wo, tuple(w)) for w in grid.directions]))
+    drawn = [spongecake.sample(layers, 0, n, wo, rng) for _ in range(count)]
     scattered = np.array([w for w, straight in drawn if not straight])
-    through = spongecake.attenuation(layers, 0, 1, wo)
+    through = spongecake.attenuation(layers, 0, n, wo)
     assert expected.sum() == pytest.approx(1 - through, rel=1e-2)
     assert abs(len(scattered) / count - (1 - through)) < 4 * np.sqrt(through * (1 - through) / count)
     assert_histogram(grid.histogram(scattered), len(scattered) * expected / expected.sum())

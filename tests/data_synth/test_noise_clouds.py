@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from data_synth import clouds, noise, scenes
+from data_synth import clouds, detail, media, noise, scenes, volumes
 from data_synth.errors import InputError
 from data_synth.jit import kernel
 
@@ -96,3 +96,13 @@ def test_other_lights_leave_a_scene_its_exposure():
     """Pictures of one scene under several lights can be compared, however dark they are; --exposure is there to change it."""
     own, other = scenes.make("stratus", resolution=8), scenes.make("stratus", "panel", resolution=8)
     assert own.exposure == other.exposure != 1.0 and len(other.lights) == 1
+
+
+def test_the_clouds_of_a_landscape_are_carved_and_end_before_the_box_does():
+    """Of what would be solid without erosion noise takes a third to most away; of a shape that is 1 just behind its rim it
+    takes hardly any."""
+    m = scenes.make("cloudscape", resolution=48).medium
+    shape, rho = media.dense(m), volumes.sampled(m)
+    solid = detail.most(m.detail, shape) == 1.0
+    assert solid.sum() > 1000 and 0.3 < (rho[solid] < 0.1).mean() < 0.9 and (rho[solid] > 0.9).mean() > 0.1
+    assert shape[[0, -1]].max() == shape[:, [0, -1]].max() == 0 < shape.max()
