@@ -84,15 +84,15 @@ def table(record: Mapping[str, Any]) -> str:
     most = max(len(row["psnr_of_runs"]) for row in rows)
     several = f"; the run of the median PSNR of {most}, in brackets the range of all" if most > 1 else ""
     lines = [
-        f"{record['data']}: {rows[0]['n_images']} held-out views at {size}; {processor(hardware)}, "
-        f"{record['threads']} threads, {hardware['kernel_path']}, nerfvol {record['nerfvol']}{several}",
+        f"{record['data']}: held-out views at {size}; {processor(hardware)}, {record['threads']} threads, "
+        f"{hardware['kernel_path']}, nerfvol {record['nerfvol']}{several}",
         "",
-        "| representation | budget | seconds | PSNR / dB | SSIM | MB | s / frame |",
-        "|---|---|---|---|---|---|---|",
+        "| representation | budget | seconds | PSNR / dB | SSIM | views | MB | s / frame |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     lines += [
         f"| {r['representation']} | {r['budget']} | {r['seconds']:.1f} | {r['psnr']:.2f}{_range(r['psnr_of_runs'])} "
-        f"| {r['ssim']:.4f} | {r['MB']:.1f} | {r['seconds_per_frame']:.3f} |"
+        f"| {r['ssim']:.4f} | {r['n_images']} | {r['MB']:.1f} | {r['seconds_per_frame']:.3f} |"
         for r in rows
     ]
     if record["published"]:

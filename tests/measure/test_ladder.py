@@ -77,6 +77,29 @@ def test_the_median_of_several_runs(tmp_path, tiny_scene, command, settings, mon
     assert f"| {row['psnr']:.2f} ({min(scores):.2f} to {max(scores):.2f}) |" in text and "median PSNR of 3" in text
 
 
+def test_the_table_says_on_how_many_views_each_run_was_scored():
+    """A short run of an octree is scored on fewer: that is no property of the first row."""
+    row = {
+        "representation": "octree",
+        "budget": "3s",
+        "seconds": 6.5,
+        "psnr": 14.1,
+        "ssim": 0.76,
+        "psnr_of_runs": [14.1],
+    }
+    row |= {"MB": 0.1, "seconds_per_frame": 0.25, "image_size": [40, 30], "n_images": 2}
+    record = {
+        "data": "d",
+        "hardware": {"cpu": "c", "kernel_path": "avx2"},
+        "threads": 2,
+        "nerfvol": "1",
+        "published": {},
+    }
+    head, *_, first, second = ladder.table(record | {"rows": [row, row | {"n_images": 20}]}).splitlines()
+    assert head.startswith("d: held-out views at 40×30;")
+    assert first == "| octree | 3s | 6.5 | 14.10 | 0.7600 | 2 | 0.1 | 0.250 |" and second.split(" | ")[5] == "20"
+
+
 def test_the_picture_shows_the_record():
     row = {
         "representation": "octree",
