@@ -119,7 +119,7 @@ class FieldConfig(Checked):
     """Share of progress at which each stage ends."""
     samples_per_step: Count = 8192
     """Samples of one step: the number of rays follows from how many samples a ray has just now."""
-    march_steps: tuple[Annotated[int, at_least(8)], ...] = (384,)
+    march_steps: tuple[Annotated[int, at_least(8)], ...] = (256,)
     """Marching steps along the diagonal of the inner cube, one a stage."""
     sampler: Literal["occupancy", "importance"] = "occupancy"
     """Skip empty space, or stratified coarse samples and inverse-CDF fine samples as the paper does."""

@@ -18,19 +18,20 @@ REACH, WIDE_REACH = 0.125, 0.25
 half as thick as a leaf that stand in the middle of it."""
 THICKEST = 20.0
 """Optical thickness of a leaf beyond which it is opaque: larger numbers change nothing and are hard to optimise."""
+_TETRAHEDRON = 2.0 * OFFSETS[OFFSETS.sum(1) % 2 == 0] - 1
 _FAINT = 1e-6  # coefficient that colour counts with where there is none: empty space has its own colour, not 0 / 0
 
 
 def write_values(octree: Octree, field: PointField, reach: float = REACH) -> None:
     """Fill an octree's vertices from a field.
 
-    A vertex is the mean over eight points around it, ``reach`` away along each axis in sides of the finest leaf that has the
-    vertex, or with ``reach`` 0 the vertex itself; colour is weighted by the coefficient, so that space in front of a surface
-    has its colour.
+    A vertex is the mean over four points around it, corners of a tetrahedron, ``reach`` away along each axis in sides of the
+    finest leaf that has the vertex, or with ``reach`` 0 the vertex itself; colour is weighted by the coefficient, so that
+    space in front of a surface has its colour.
     """
     positions, spacing = octree.vertex_positions(), finest_sides(octree)
     to_sh, slots = sh_of(field, octree.sh_degree), sh_slots(octree.sh_degree).reshape(-1)
-    offsets = reach * (2.0 * OFFSETS - 1) if reach else np.zeros((1, 3))
+    offsets = reach * _TETRAHEDRON if reach else np.zeros((1, 3))
     some = max(1, cells.CHUNK // len(offsets))
     values = octree.values
     for start in range(0, octree.n_vertices, some):

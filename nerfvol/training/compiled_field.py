@@ -19,6 +19,7 @@ from nerfvol.field.layout import Domain
 from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_model import CompiledField
 from nerfvol.kernels.field_ops import FieldBatch, FieldLoss, FieldRates, FieldState, March, Occupancy
+from nerfvol.kernels.field_state import COARSE
 from nerfvol.native import native
 from nerfvol.neural import FieldModel
 from nerfvol.training.appearance import Appearance, small_picture
@@ -44,6 +45,8 @@ THINNED = (160, 200, 240, 280, 320, 380, 440, 500, 600, 700, 850, 1000, 1300, 16
 THIN_DECAY = 0.5
 """... after so many, every occupied cell, and what was seen of it before counts by this factor: haze of the first steps would
 stay occupied for thousands of steps, and be half of the samples; ..."""
+SETTLED = THINNED[6]
+"""After so many steps little haze is left."""
 PROBE_EVERY, PROBES = 64, 32768
 """... and from the sweeps on, each so many steps, so many cells, half of them among the occupied ones."""
 SLOW_LEVELS, SLOW_EVERY = 3, 2
@@ -119,7 +122,7 @@ class CompiledFieldTrainer:
 
     name = "field"
     rates = "field.rate"
-    previews = (0.1, 0.4, 1.0)
+    previews = (0.6, 1.0)  # not of haze, which takes long
     preview_width = 400
     stages_left = 0
     most_steps = math.inf
@@ -163,8 +166,12 @@ class CompiledFieldTrainer:
         return seconds if self.final else min(self.config.time_budget, FIELD_SHARE * seconds)
 
     def size(self) -> str:
-        """See Phase."""
-        return f"{self.n_rays} rays"
+        """See Phase: where it is the product, what a picture takes follows from the occupied cells, in powers of two; before
+        haze is gone it takes seconds, and tells nothing of the end."""
+        if not self.final or self.steps_done < SETTLED:
+            return f"{self.parameter_bytes // 4:,} parameters"
+        cells = int(np.unpackbits(self.occupancy.coarse.view(np.uint8)).sum()) * COARSE**3
+        return f"{self.parameter_bytes // 4:,} parameters, about {2 ** round(math.log2(max(1, cells))):,} cells"
 
     def seconds_to_write(self) -> float:
         """Distilling comes first, where an octree follows."""

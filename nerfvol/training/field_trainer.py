@@ -197,7 +197,7 @@ class FieldTrainer:
 
     def size(self) -> str:
         """See Phase."""
-        return f"{self.n_rays} rays"
+        return f"{self.parameter_bytes // 4:,} parameters"
 
     def seconds_to_write(self) -> float:
         """Distilling comes first."""
