@@ -29,21 +29,23 @@ NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 Float = NDArray[np.float64]
 
 
-def as_own_document(path: str | os.PathLike[str], document: Any) -> dict[str, Any]:
-    """``document`` as {"frames": [...], ...} with the keys of transforms.json, and "fps", "seconds", "loop" where stated.
+def as_own_document(path: str | os.PathLike[str], document: Any) -> tuple[dict[str, Any], list[str]]:
+    """``document`` as {"frames": [...], ...} with the keys of transforms.json, and "fps", "seconds", "loop" where stated; and
+    sentences on what of it is not used or only guessed.
 
     Raises:
         InputError: it is no camera path of a known kind, or a frame lacks what its kind has; names the file and the frame.
     """
     frames = document.get("frames") if isinstance(document, dict) else None
     if isinstance(frames, list) and frames:
-        return document
+        return document, []
     if isinstance(document, list) and document and isinstance(document[0], dict) and "rotation" in document[0]:
-        return {"frames": _each(path, document, _inria)}
+        return {"frames": _each(path, document, _inria)}, []
     if isinstance(document, dict) and isinstance(document.get("camera_path"), list) and document["camera_path"]:
-        return _nerfstudio(path, document)
+        return _nerfstudio(path, document), _doubts(path, document)
     if isinstance(document, dict) and isinstance(document.get("path"), list) and document["path"]:
-        return {"frames": _each(path, document["path"], _ngp), "loop": document.get("loop") is True, "keyframes": True}
+        own = {"frames": _each(path, document["path"], _ngp), "loop": document.get("loop") is True, "keyframes": True}
+        return own, []
     raise InputError(
         f"{path}: expected a camera path, an object with a non-empty list 'frames' (or the path of nerfstudio's viewer, "
         "cameras.json of 3D Gaussian splatting, base_cam.json of instant-ngp)"
@@ -113,7 +115,7 @@ def _ngp(entry: Mapping[str, Any]) -> dict:
 def _nerfstudio(path: str | os.PathLike[str], document: Mapping[str, Any]) -> dict[str, Any]:
     if document.get("camera_type", "perspective") != "perspective":
         raise InputError(f"{path}: camera_type {document['camera_type']!r:.40} is not supported, expected perspective")
-    back = _nerfstudio_frame(Path(path).parent / "dataparser_transforms.json")
+    back = _nerfstudio_frame(Path(path).parent / _DATAPARSER)
 
     def read(entry: Mapping[str, Any]) -> dict:
         pose = _numbers(entry, "camera_to_world", 4, 4)
@@ -131,6 +133,21 @@ def _nerfstudio(path: str | os.PathLike[str], document: Mapping[str, Any]) -> di
         "loop": document.get("is_cycle") is True,
         "frames": _each(path, document["camera_path"], read),
     }
+
+
+_DATAPARSER = "dataparser_transforms.json"
+
+
+def _doubts(path: str | os.PathLike[str], document: Mapping[str, Any]) -> list[str]:
+    said = []
+    if not (Path(path).parent / _DATAPARSER).is_file():
+        said.append(
+            f"{_DATAPARSER} is not beside {path}: its poses are taken as the data set's, which nerfstudio turns, moves and "
+            "scales unless told not to"
+        )
+    if document.get("crop"):
+        said.append(f"{path} states a crop, which is not used")
+    return said
 
 
 def _nerfstudio_frame(beside: Path) -> Callable[[Float, Float], tuple[Float, Float]]:

@@ -34,13 +34,14 @@ LARGEST_SIDE = 16384
 class CameraPath:
     """What a file says: its cameras; loop: the last is followed by the first; keyframes: whether to interpolate between
     them; fps
-    and seconds: None where it does not say."""
+    and seconds: None where it does not say; said: sentences on what of it is not used or only guessed."""
 
     cameras: list[Camera]
     loop: bool = False
     keyframes: bool = False
     fps: float | None = None
     seconds: float | None = None
+    said: Sequence[str] = ()
 
 
 def load_cameras(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> list[Camera]:
@@ -56,7 +57,7 @@ def load_path(path: str | os.PathLike[str], size: tuple[int, int] | None = None)
     Raises:
         InputError: not JSON, no frames, a matrix that is no rigid pose, intrinsics that are unusable.
     """
-    document = as_own_document(path, read_json(path))
+    document, said = as_own_document(path, read_json(path))
     shared = {key: value for key, value in document.items() if key != "frames"}
     cameras = []
     for index, frame in enumerate(document["frames"]):
@@ -73,7 +74,7 @@ def load_path(path: str | os.PathLike[str], size: tuple[int, int] | None = None)
         raise InputError(f"{path}: {error}") from error
     if bad := [key for key, value in timing.items() if value is not None and value <= 0]:
         raise InputError(f"{path}: {bad[0]} must be positive, got {timing[bad[0]]:g}")
-    return CameraPath(cameras, document.get("loop") is True, document.get("keyframes") is True, **timing)
+    return CameraPath(cameras, document.get("loop") is True, document.get("keyframes") is True, **timing, said=said)
 
 
 def _camera(calibration: Calibration, c2w: np.ndarray, size: tuple[int, int] | None) -> Camera:

@@ -217,6 +217,8 @@ def _cameras(options: RenderOptions, target: Target) -> tuple[list[Camera], floa
     if options.cameras is None and not Path(name).exists() and not Path(name).suffix:
         raise InputError(f"unknown path {name!r}: expected {', '.join(MOVES)}, or a file")
     path = load_path(name, options.size)
+    for sentence in path.said:
+        print(sentence)
     fps = options.fps or path.fps or 30.0
     count = _count(options) or (max(1, round(options.seconds * fps)) if options.seconds else None)
     if count is None and path.keyframes:

@@ -26,6 +26,10 @@ FEW, ENOUGH_TO_JUDGE = 0.1, 10
 """Share of the frames that may be left out because they are damaged or do not fit the others, and of how many at least."""
 
 
+PHOTOGRAPHS = re.compile(r"images_?(\d*)|(input|image|rgb|color)")
+"""Names of folders of photographs, in small letters; the number says by how much they are reduced."""
+
+
 def are_few(wrong: int, n: int) -> bool:
     """Whether so many of ``n`` frames may be left out."""
     return wrong <= max(1, FEW * n) and n >= ENOUGH_TO_JUDGE
@@ -215,8 +219,9 @@ class ImageFinder:
         A path that leads nowhere is looked for by its last parts below the folder where it is an absolute one of another
         machine, else by its name in the folder itself; and as the address it may be (file:///a%20b).
         """
+        listed = listed.strip()
         try:
-            found = self._find(self._folder / listed.replace("\\", "/")) or self._by_end(listed)
+            found = self._find(self._folder / listed.replace("\\", "/")) or self._by_end(listed) or self._nearby(listed)
             address = unquote(re.sub("^file://", "", listed))
             return found if found is not None or address == listed else self.find(address)
         except (OSError, ValueError):  # a name too long, half a character
@@ -229,6 +234,23 @@ class ImageFinder:
             if (found := self._find(self._folder.joinpath(*parts[first:]))) is not None:
                 return found
         return None
+
+    def _nearby(self, listed: str) -> Path | None:
+        """Where the folder that is named is not there: its name in other letters, or the least reduced photographs."""
+        *folders, name = [part for part in listed.replace("\\", "/").split("/") if part not in ("", ".")]
+        if not folders or (self._folder / "/".join(folders)).is_dir():
+            return None
+        place: Path | None = self._folder
+        for part in folders:
+            place = None if place is None else self._names(place).get(_plain(part))
+        if place is not None and (found := self._find(place / name)) is not None:
+            return found
+        others = [
+            (int(number[1] or 0), folder)
+            for folder in self._names(self._folder).values()
+            if (number := PHOTOGRAPHS.fullmatch(folder.name.lower())) and folder.is_dir()
+        ]
+        return next((found for _, folder in sorted(others) if (found := self._find(folder / name))), None)
 
     def _find(self, path: Path) -> Path | None:
         names, stem = self._names(path.parent), _plain(path.name)

@@ -7,7 +7,6 @@ original photographs. Source: docs/data.md.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.colmap_files import read_images
-from nerfvol.datasets.listing import Frame, Listing, Poses, is_photograph, named
+from nerfvol.datasets.listing import PHOTOGRAPHS, Frame, Listing, Poses, is_photograph, named
 from nerfvol.datasets.masks import MaskFinder
 from nerfvol.datasets.split_lists import split_frames
 from nerfvol.errors import InputError
@@ -97,7 +96,7 @@ def image_folder(folder: Path) -> Path:
     it, image, rgb or color; a folder without them holds the photographs itself."""
     factors = {}
     for entry in sorted(folder.iterdir()):
-        factor = re.fullmatch(r"images_?(\d*)|(input|image|rgb|color)", entry.name.lower())
+        factor = PHOTOGRAPHS.fullmatch(entry.name.lower())
         if factor is not None and entry.is_dir():
             factors[entry] = np.inf if factor[2] else int(factor[1] or 1)
     return min(factors, key=lambda entry: factors[entry]) if factors else folder
@@ -113,13 +112,15 @@ def _load_rows(path: Path) -> NDArray[np.float64]:
     lost = ~stated & ~np.isfinite(rows[:, :15]).any(axis=1)
     if stated.any():  # a view without a pose is left out later, whatever its lens
         rows[np.ix_(lost, np.array([4, 9, 14]))] = rows[stated.argmax(), [4, 9, 14]]
-    if not np.isfinite(rows[:, [4, 9, 14]]).all():
+    if not stated.any():
         raise InputError(f"{path}: expected finite sizes and focal lengths, got NaN or infinity")
     return rows.astype(np.float64)
 
 
 def _calibration(column: NDArray[np.float64]) -> Calibration:
     height, width, focal = map(float, column)
+    if not np.isfinite(column).all():
+        raise InputError(f"expected a finite size and focal length, got {width:g}x{height:g} and {focal:g}")
     if min(height, width) < 1 or height != int(height) or width != int(width):
         raise InputError(f"the image size must be whole numbers of pixels, got {width:g}x{height:g}")
     return Calibration(width=int(width), height=int(height), fx=focal, fy=focal, resizable=True)

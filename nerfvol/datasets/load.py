@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,25 +31,17 @@ from nerfvol.datasets.images import (
     masked_average,
     read_image,
     read_pixels,
-    read_small,
     turned,
     writeable,
 )
 from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
 from nerfvol.datasets.listing import Frame, Listing, listed_names, named, require_few
 from nerfvol.datasets.odd_ones import blank
+from nerfvol.datasets.sampled import Sampled, sample, seen_small
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError, shown
-from nerfvol.files.unchanged import while_unchanged
 from nerfvol.machine import total_memory
 from nerfvol.region import SceneBounds, check_box
-
-MOST_JUDGED = 24
-"""Training pictures that the kind of scene is judged by, ..."""
-JUDGED_SIZE = 128
-"""... at about so many pixels along the shorter side."""
-MOST_KEPT = 64 << 20
-"""Bytes of them that are kept whole until they are wanted so."""
 
 
 def load_dataset(
@@ -102,10 +94,10 @@ def load_dataset(
     cameras = [view.camera.scaled(downscale) for view in views]
     _require_memory(cameras, downscale)
     views = with_common_masks(views, training_views, messages)
-    judged, sampled = _sample(training_views, threads)
+    judged, sampled = sample(training_views, threads)
     views, circles = with_circles(views, judged, messages)
     judged = [(replace(view, circle=circles.get(view.camera.intrinsics)), picture) for view, picture in judged]
-    evidence = look([picture for _, picture in judged], [_seen_small(view, picture) for view, picture in judged])
+    evidence = look(*seen_small(judged))
     bounds, decision, said = _scene_of(listing, training_views, box, evidence, scene)
     messages += [*decision.doubts, decision.sentence, said]
     # In photographs of a place what is transparent was not seen, by whatever cut it out.
@@ -145,6 +137,7 @@ def _readable(views: Sequence[View], messages: list[str], threads: int | None) -
     def damage(view: View) -> InputError | None:
         try:
             read_image(view.path)
+            view.seen()
         except InputError as error:
             return error
         return None
@@ -190,59 +183,7 @@ def _of_box(box: NDArray[np.float64], cameras: Sequence[Camera], what: str) -> s
     )
 
 
-@dataclass(eq=False)
-class _Sampled:
-    """A picture to look at, small, and the whole one until it is taken, as both came from the file."""
-
-    small: UInt8
-    whole: UInt8 | None
-
-    def take(self) -> UInt8 | None:
-        """The whole picture, once."""
-        whole, self.whole = self.whole, None
-        return whole
-
-
-@while_unchanged(MOST_JUDGED)
-def _sampled(path: Path) -> _Sampled:
-    """Every split of a scene is judged by the same pictures."""
-    small, whole = read_small(path, JUDGED_SIZE)
-    # Where the picture itself is small enough it is what is looked at: it would stay for as long as that does.
-    kept = whole is not None and whole is not small and whole.nbytes <= MOST_KEPT // MOST_JUDGED
-    return _Sampled(small, whole if kept else None)
-
-
-def _sample(views: Sequence[View], threads: int | None) -> tuple[list[tuple[View, UInt8]], dict[Path, _Sampled]]:
-    """A few training views with their pictures, small, by which the kind of scene is judged; and these as their files have
-    them, with what was decoded whole."""
-    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, MOST_JUDGED).round().astype(int))]
-
-    def small(view: View) -> _Sampled | InputError:
-        try:
-            return _sampled(view.path)
-        except InputError as error:
-            return error
-
-    found = list(zip(chosen, map_threads(small, chosen, threads), strict=True))
-    wrong = [error for _, error in found if isinstance(error, InputError)]
-    if len(wrong) == len(found):
-        raise wrong[0]
-    good = [(view, sampled) for view, sampled in found if isinstance(sampled, _Sampled)]
-    return [(view, turned(s.small, view.orientation)) for view, s in good], {view.path: s for view, s in good}
-
-
-def _seen_small(view: View, picture: UInt8) -> NDArray[np.bool_] | None:
-    """Which pixels (h, w) of the view's small picture count; None: all."""
-    mask = view.seen()
-    if mask is None:
-        return None
-    rows, columns = (
-        ((np.arange(n) + 0.5) * have / n).astype(int) for n, have in zip(picture.shape[:2], mask.shape, strict=True)
-    )
-    return mask[rows[:, None], columns] > 127
-
-
-def _decoded(view: View, sampled: _Sampled | None, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
+def _decoded(view: View, sampled: Sampled | None, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
     """A view's image and mask at its final size; of ``sampled`` where that has it whole."""
     whole = None if sampled is None else sampled.take()
     image = read_pixels(view.path, view.orientation) if whole is None else turned(whole, view.orientation)

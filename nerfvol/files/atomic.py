@@ -42,6 +42,8 @@ _REASONS = {
 def explain_os_error(error: OSError) -> str:
     """The cause of ``error`` in a few words, without numbers or class names."""
     lines = (error.strerror or str(error)).strip().splitlines() or [type(error).__name__]
+    if error.errno is None and re.fullmatch(r"\d+ requested and \d+ written", lines[0]):  # numpy's tofile
+        return _REASONS[errno.ENOSPC]
     return _REASONS.get(error.errno or 0, lines[0])
 
 

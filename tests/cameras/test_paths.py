@@ -173,6 +173,10 @@ def test_nerfstudio(tmp_path):
     path = load_path(saved(tmp_path, nerfstudio([c.c2w for c in CAMERAS])))
     same(path.cameras)
     assert (path.loop, path.fps, path.seconds) == (True, 24, 2.0)
+    (sentence,) = path.said
+    assert "dataparser_transforms.json is not beside" in sentence
+    path = load_path(saved(tmp_path, nerfstudio([CAMERAS[0].c2w]) | {"crop": {"crop_scale": [1, 1, 1]}}))
+    assert "a crop, which is not used" in path.said[1]
 
 
 def test_nerfstudio_in_the_coordinates_of_its_loader(tmp_path):
@@ -190,6 +194,7 @@ def test_nerfstudio_in_the_coordinates_of_its_loader(tmp_path):
         same([Camera(LENS, m) for m in matrices])
     assert all(np.allclose(a.position, b.position) for a, b in zip(load_path(path).cameras, CAMERAS, strict=True))
     same(load_path(path).cameras)
+    assert not load_path(path).said
 
 
 def test_gaussian_splatting(tmp_path):

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from nerfvol.datasets import load
+from nerfvol.datasets import load, sampled
 from nerfvol.datasets.dataset import NEAR_SHARE, Dataset
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
@@ -80,9 +80,9 @@ def test_what_stands_before_a_lens(tiny_scene):
 def test_pictures_that_the_kind_of_scene_is_judged_by_are_decoded_once_for_all_splits(tmp_path, monkeypatch):
     """And again where a file has changed: by its time, or by its size."""
     write_scene(tmp_path, {"train": 5, "val": 2}, size=20)
-    read, asked = load.read_small, []
-    monkeypatch.setattr(load, "read_small", lambda path, size: asked.append(path.name) or read(path, size))
-    load._sampled.cache_clear()
+    read, asked = sampled.read_small, []
+    monkeypatch.setattr(sampled, "read_small", lambda path, size: asked.append(path.name) or read(path, size))
+    sampled._sampled.cache_clear()
     for split in ("train", "val", "train"):
         kind = load_dataset(tmp_path, split).kind
     assert sorted(asked) == [f"r_{i}.png" for i in range(5)] and kind == "object"
@@ -119,7 +119,7 @@ def test_what_was_decoded_to_judge_the_scene_is_not_decoded_again(tmp_path, monk
     write_scene(tmp_path, {"train": 3, "val": 1}, size=300)
     read, asked = load.read_pixels, []
     monkeypatch.setattr(load, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
-    load._sampled.cache_clear()
+    sampled._sampled.cache_clear()
     dataset = load_dataset(tmp_path, "train", downscale)
     first = [image.copy() for image in dataset.images]
     assert asked == []

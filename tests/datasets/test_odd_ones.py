@@ -116,6 +116,46 @@ def test_pictures_that_were_converted_are_found(tmp_path):
     said(load_dataset(tmp_path), "1 images that are not on disk")
 
 
+@pytest.mark.parametrize("listed", [
+    "IMAGES/VIEW_{:03d}.PNG", " images/view_{:03d}.png", "images/view_{:03d}.png\n", "images_2/view_{:03d}.png",
+    ".\\Images\\view_{:03d}",
+])  # fmt: skip
+def test_pictures_that_are_listed_in_another_spelling_or_size_are_found(tmp_path, listed):
+    def rename(document):
+        for i, frame in enumerate(document["frames"]):
+            frame["file_path"] = listed.format(i)
+
+    scene(tmp_path, change=rename)
+    (tmp_path / "masks").mkdir()
+    assert len(load_dataset(tmp_path)) == 10
+    shutil.copytree(tmp_path / "images", tmp_path / "images_8")  # the least reduced is taken
+    assert len(load_dataset(tmp_path)) == 10
+
+
+@pytest.mark.parametrize("mask", [b"", scenes.png_bytes(np.zeros((5, 24, 1), np.uint8))])
+def test_one_mask_that_cannot_be_used_takes_its_picture_with_it(tmp_path, mask):
+    scene(tmp_path)
+    (tmp_path / "masks").mkdir()
+    whole = np.full((16, 24, 1), 255, np.uint8)
+    whole[:5] = 0
+    for i in range(12):
+        (tmp_path / f"masks/view_{i:03d}.png").write_bytes(mask if i == 3 else scenes.png_bytes(whole))
+    dataset = load_dataset(tmp_path)
+    assert len(dataset) == 9 and all(dataset.mask(i) is not None for i in range(9))
+    said(dataset, "1 images cannot be read and are left out", "masks/view_003.png")
+
+
+@pytest.mark.parametrize("column", [4, 14])
+def test_one_row_of_llff_without_a_lens_is_left_out(tmp_path, column):
+    scenes.write_llff(tmp_path, scenes.ring(12), scenes.random_images(12))
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    rows[3, column] = np.nan
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    dataset = load_dataset(tmp_path)
+    assert len(dataset) == 9
+    said(dataset, "1 of 12 frames cannot be used", "expected a finite size and focal length")
+
+
 @pytest.mark.parametrize("folder", ["frames", "Undistorted"])
 def test_photographs_of_a_model_lie_in_whatever_folder_has_them(tmp_path, folder):
     scenes.write_colmap(tmp_path, scenes.ring(12), scenes.random_images(12))

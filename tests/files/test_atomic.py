@@ -170,3 +170,8 @@ def test_json_that_says_two_things_or_too_much_is_refused(tmp_path, text, reason
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError, match=reason):
         atomic.read_json(tmp_path / "a.json")
+
+
+def test_what_numpy_says_of_a_full_disk_is_said_as_one():
+    assert atomic.explain_os_error(OSError("110592 requested and 32736 written")) == "no space is left on the device"
+    assert atomic.explain_os_error(OSError("2 requested")) == "2 requested"
