@@ -157,6 +157,14 @@ def test_a_weather_map_says_where_clouds_are(textures):
     assert rain[4, 2, 0] == pytest.approx(0.4)  # bilinear in between
 
 
+def test_types_are_mixed_between_their_neighbours():
+    kinds = (clouds.STRATUS, clouds.CUMULUS, clouds.CUMULONIMBUS)
+    for h in (0.05, 0.1, 0.3, 0.6, 0.9):
+        low, middle, tall = (clouds.height_gradient(kind, h) for kind in kinds)
+        for kind, want in ((0, low), (0.2, 0.6 * low + 0.4 * middle), (0.5, middle), (0.8, 0.4 * middle + 0.6 * tall), (1, tall)):
+            assert weather.mixed_gradient(kind, h) == pytest.approx(want, abs=1e-12)
+
+
 def test_a_picture_is_a_weather_map_with_north_up(tmp_path):
     pixels = np.zeros((2, 3, 3), np.uint8)
     pixels[0, 2] = (255, 51, 102)  # north-east
