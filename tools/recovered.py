@@ -17,12 +17,13 @@ os.environ["NUMBA_DISABLE_JIT"] = "1"  # a few thousand look-ups
 import numpy as np
 
 import data_synth as ds
-from data_synth import lookups, surfaces
-from data_synth.scenes.showcase import haze_density
+from data_synth import lookups, media, surfaces
+from data_synth.scenes.showcase import Showcase, haze_density
 from data_synth.scenes.showcase_sdf import distance
 from nerfvol.measure.truth import random_chords
 from nerfvol.models import load_model
 from nerfvol.octree.points import octree_density
+from nerfvol.views import OctreeModel
 
 MARGIN = 0.06  # u: some of the finest cells that a short training has
 POINTS, SAMPLES = 3000, 96  # of the density; along a chord
@@ -32,12 +33,15 @@ Field = Callable[[float, float, float], float]
 def known(name: str) -> tuple[np.ndarray, np.ndarray, Field, Callable[[float, float, float], bool]]:
     """(lo, hi, green extinction in 1/u, whether a point is clear of solids) of a scene."""
     scene = ds.scenes.make(name)
-    if name == "showcase":
+    if isinstance(scene, Showcase):
         haze = scene.haze
         reach, half = haze.radius + 3 * haze.width, 3 * haze.width + 0.10
         lo, hi = np.array([-reach, -reach, haze.height - half]), np.array([reach, reach, haze.height + half])
         return lo, hi, lambda x, y, z: haze_density(haze, x, y, z), lambda x, y, z: distance(x, y, z) > MARGIN
-    m, solid = scene.medium, surfaces.geometry(scene.shapes, scene.triangles).shapes
+    m = scene.medium
+    if not isinstance(m, media.Medium):
+        raise SystemExit(f"expected a scene with one medium, {name} has none")
+    solid = surfaces.geometry(scene.shapes, scene.triangles).shapes
     about = [np.zeros(3), *(MARGIN * sign * axis for axis in np.eye(3) for sign in (1, -1))]
 
     def clear(x: float, y: float, z: float) -> bool:
@@ -60,7 +64,10 @@ def main(argv: list[str]) -> int:
     """Print density and opacity along chords."""
     name, run = argv
     lo, hi, sigma, clear = known(name)
-    octree = load_model(run).octree
+    model = load_model(run)
+    if not isinstance(model, OctreeModel):
+        raise SystemExit(f"{run}: expected an octree")
+    octree = model.octree
     points = lo + np.random.default_rng(0).random((POINTS, 3)) * (hi - lo)
     points = points[[clear(*p) for p in points]]
     print("density: ", compare(octree_density(octree, points), np.array([sigma(*p) for p in points])))

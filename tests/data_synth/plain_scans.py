@@ -146,7 +146,8 @@ def test_a_gap_between_two_bodies_leaves_no_trace(integrated):
 
 def test_a_ray_that_comes_out_of_empty_bricks_begins_with_the_value_there():
     """Opacity is in the last of four bricks alone, from its first step on: 1 - exp(-sigma integral of o dv)."""
-    band = np.array([[0, 0, 1, 1, 1], [0.76, 0, 1, 1, 1], [0.765, 0.1, 1, 1, 1], [0.9, 0.1, 1, 1, 1], [0.905, 0, 1, 1, 1], [1, 0, 1, 1, 1.0]])  # fmt: skip
+    band = np.ones((6, 5))
+    band[:, :2] = [[0, 0], [0.76, 0], [0.765, 0.1], [0.9, 0.1], [0.905, 0], [1, 0]]
     c = ramp(band, n=33)
     assert (c.values.brick_max.reshape(c.values.bricks)[:3] == 0).all()
     assert -np.log(1 - seen(c, ALONG, integrated=True)[1]) == pytest.approx(0.014 * SIGMA, rel=1e-2)

@@ -185,7 +185,8 @@ def test_single_scattering_of_two_suns_for_odd_parameters(size, scale):
     length, sigma = (t1 - t0)[..., None], np.array([0.3, 0.6, 1.2]) / scale
     T = np.exp(-sigma * length)
     far = (t0[..., None] * (1 - T) + (1 - (1 + sigma * length) * T) / sigma).mean(-1)
-    suns = [(np.array(w) / np.linalg.norm(w), np.array(E)) for w, E in (((0.4, -0.8, 0.9), (5.0, 4, 3)), ((-0.7, 0.2, 0.5), (1.0, 2, 3)))]  # fmt: skip
+    towards, E = np.array([[0.4, -0.8, 0.9], [-0.7, 0.2, 0.5]]), np.array([[5.0, 4, 3], [1, 2, 3]])
+    suns = list(zip(towards / np.linalg.norm(towards, axis=1, keepdims=True), E, strict=True))
     for albedo, g in itertools.product((0.0, 1.0, (0.1, 0.9, 0.5)), (-0.9, 0.9)):
         want, n = np.zeros((*t0.shape, 3)), 200
         for t in (t0 + (k + 0.5) / n * (t1 - t0) for k in range(n)):
