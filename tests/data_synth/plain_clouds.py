@@ -122,6 +122,23 @@ def test_octaves_are_finer_and_their_mean_keeps_its_range(textures):
     assert np.allclose(values[1], np.array([1, 0.4, 0.16]) @ parts / 1.56)
 
 
+def test_noise_is_wispy_and_pushed_at_the_base_and_upside_down_at_the_top(textures):
+    """Under curl noise that is (1/2, -1/4) everywhere: at z = 0 the noise itself, from a place as far off; at z = 1 its
+    complement, from where it is asked for; halfway there at z = 1/16."""
+    d = detail.detail(textures, (1, 1, 1), 0.5)
+    noise_alone = d.values[: d.n**3]
+    steady = np.broadcast_to(np.array([0.5, -0.25], np.float32), (4, 4, 2)).ravel()
+    d = d._replace(values=np.concatenate([noise_alone, steady]), p=4)
+    texture = noise_alone.reshape((d.n,) * 3 + (1,))
+    for x, y in np.random.default_rng(7).random((20, 2)):
+        dx, dy = 0.5 * detail.CURL_SHIFT, -0.25 * detail.CURL_SHIFT
+        assert detail.noise_at(d, x, y, 0.0) == pytest.approx(
+            noise.texture_at(texture, x + dx, y + dy, 0.0, 0), abs=1e-6
+        )
+        assert detail.noise_at(d, x, y, 1.0) == pytest.approx(1 - noise.texture_at(texture, x, y, 1.0, 0), abs=1e-6)
+        assert detail.noise_at(d, x, y, 1 / 16) == pytest.approx(0.5, abs=1e-6)
+
+
 def test_a_medium_of_many_keeps_its_detail(medium):
     many = pool.pool([media.homogeneous((0, 0, 0), (1, 1, 1)), medium, media.homogeneous((0, 0, 0), (1, 1, 1))])
     where, _ = points(medium, 50)
@@ -155,6 +172,20 @@ def test_a_weather_map_says_where_clouds_are(textures):
     assert rain[4, 0].max() == pytest.approx(0.8) and rain[4, 0, 0] == pytest.approx(0.8)
     assert (np.diff(rain[4, 0]) <= 0).all() and rain[4, 0, -1] == 0 and not rain[4, 4].any()
     assert rain[4, 2, 0] == pytest.approx(0.4)  # bilinear in between
+
+
+def test_types_are_mixed_between_their_neighbours():
+    kinds = (clouds.STRATUS, clouds.CUMULUS, clouds.CUMULONIMBUS)
+    for h in (0.05, 0.1, 0.3, 0.6, 0.9):
+        low, middle, tall = (clouds.height_gradient(kind, h) for kind in kinds)
+        for kind, want in (
+            (0, low),
+            (0.2, 0.6 * low + 0.4 * middle),
+            (0.5, middle),
+            (0.8, 0.4 * middle + 0.6 * tall),
+            (1, tall),
+        ):
+            assert weather.mixed_gradient(kind, h) == pytest.approx(want, abs=1e-12)
 
 
 def test_a_picture_is_a_weather_map_with_north_up(tmp_path):

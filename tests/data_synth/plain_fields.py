@@ -185,6 +185,8 @@ def test_flakes_are_mixed_and_stay_positive():
         assert np.linalg.eigvalsh(sggx.matrices(found))[0] > 0
         d = unit(*rng.normal(size=3))
         assert 0 < lookups.extinction(m, tuple(p), d) <= m.flake_area
+    long = np.broadcast_to(sggx.check_sggx(np.diag([4.0, 1.0, 0.25])), (2, 2, 2, 6))
+    assert media.grid(np.ones((2,) * 3), *BOX, S=long).flake_area == pytest.approx(2.0, rel=1e-6)
     for axis in rng.normal(size=(40, 3)):  # 1e-8: less than single precision resolves
         flat = np.broadcast_to(sggx.surface(axis, 1e-4), (2, 2, 2, 6))
         own = lookups.phase_at(media.grid(np.ones((2,) * 3), *BOX, S=flat), (0.3, 0.2, 0.1)).own

@@ -221,6 +221,10 @@ def test_a_medium_of_many_keeps_its_flakes():
     assert lookups.extinction(got, (0.5,) * 3, WO) == phase.projected_area(m.phase, 0.0, WO) != 1.0
     assert phase.projected_area(m.phase, 1.0, WO) != phase.projected_area(m.phase, 0.0, WO)
     assert m.flake_area == m.phase.table.sigma.max()
+    kind = np.broadcast_to(np.linspace(0, 1, 3)[:, None, None], (3, 3, 3))
+    mixed = media.grid(np.ones((3, 3, 3)), (0, 0, 0), (1, 1, 1), phase=m.phase, attribute=kind)
+    for x in (0.1, 0.9):
+        assert lookups.extinction(mixed, (x, 0.5, 0.5), WO) == phase.projected_area(m.phase, np.float32(x), WO)
 
 
 FACING = microflakes.beckmann((0, 0, 1), 0.5, 32)

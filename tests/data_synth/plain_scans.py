@@ -84,6 +84,8 @@ def test_bricks_bound_the_opacity_between_samples():
     found = np.array([raycast.at_value(c.points, raycast.value(c.values, tuple(11 * p)), 0) for p in u])
     brick = np.ravel_multi_index(((u * 11).astype(int) // 8).T, c.values.bricks)
     assert found.max() > 0.5 and (found <= c.values.brick_max[brick]).all()
+    even = raycast.classified(np.full((9, 9, 9), 0.59), (0, 0, 0), (1, 1, 1), SMOOTH, SIGMA)
+    assert even.values.brick_max[0] >= raycast.at_value(even.points, 0.59, 0) - 1e-6
     empty = raycast.classified(np.full((12, 12, 12), 0.4), (0, 0, 0), (1, 1, 1), PEAK, SIGMA)
     assert empty.values.brick_max[0] == 0.0  # and is skipped
 
@@ -140,6 +142,15 @@ def test_a_gap_between_two_bodies_leaves_no_trace(integrated):
     alpha = seen(c, ((-1.03, 0.4, 0.5), (1.0, 0.0, 0.0)), integrated=integrated, finer=8)[1]
     # ramps of a cell on both sides of the first body and before the second are half a cell each
     assert -np.log(1 - alpha) == pytest.approx(0.1 * SIGMA / 8 * (4 + 1 + 5 + 0.5), rel=1e-3)
+
+
+def test_a_ray_that_comes_out_of_empty_bricks_begins_with_the_value_there():
+    """Opacity is in the last of four bricks alone, from its first step on: 1 - exp(-sigma integral of o dv)."""
+    band = np.ones((6, 5))
+    band[:, :2] = [[0, 0], [0.76, 0], [0.765, 0.1], [0.9, 0.1], [0.905, 0], [1, 0]]
+    c = ramp(band, n=33)
+    assert (c.values.brick_max.reshape(c.values.bricks)[:3] == 0).all()
+    assert -np.log(1 - seen(c, ALONG, integrated=True)[1]) == pytest.approx(0.014 * SIGMA, rel=1e-2)
 
 
 def test_several_rays_a_pixel_are_the_mean_of_their_places():

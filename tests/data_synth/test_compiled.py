@@ -167,6 +167,44 @@ def test_alpha_is_the_closed_form(kind):
         assert_means(values.mean(axis=0), values.var(axis=0, ddof=1) / len(values), want, bias=ROUNDING)
 
 
+def lobe(g, cosine):
+    return (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1)])
+def test_single_scattering_of_two_suns_for_odd_parameters(size, scale):
+    """Colour, alpha and distance against quadrature: mean cosines of +-0.9, albedo 0, 1 and of each colour, pictures of one
+    row, one column and one pixel, thousandfold scales."""
+    c = Camera(*size, 12.0, look_at((0.3 * scale, -4 * scale, 0.4 * scale), (0.05 * scale, 0, 0.1 * scale)))
+    i, j = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    d = np.stack([(i - size[0] / 2) / 12, -(j - size[1] / 2) / 12, -np.ones_like(i)], -1) @ c.c2w[:3, :3].T
+    o, d = c.c2w[:3, 3], d / np.linalg.norm(d, axis=-1, keepdims=True)
+    ends = np.sort([(-scale - o) / d, (scale - o) / d], axis=0)
+    t0, t1 = ends[0].max(-1), ends[1].min(-1)
+    length, sigma = (t1 - t0)[..., None], np.array([0.3, 0.6, 1.2]) / scale
+    T = np.exp(-sigma * length)
+    far = (t0[..., None] * (1 - T) + (1 - (1 + sigma * length) * T) / sigma).mean(-1)
+    towards, E = np.array([[0.4, -0.8, 0.9], [-0.7, 0.2, 0.5]]), np.array([[5.0, 4, 3], [1, 2, 3]])
+    suns = list(zip(towards / np.linalg.norm(towards, axis=1, keepdims=True), E, strict=True))
+    for albedo, g in itertools.product((0.0, 1.0, (0.1, 0.9, 0.5)), (-0.9, 0.9)):
+        want, n = np.zeros((*t0.shape, 3)), 200
+        for t in (t0 + (k + 0.5) / n * (t1 - t0) for k in range(n)):
+            p = o + t[..., None] * d
+            for w, E in suns:
+                out = np.where(w > 0, (scale - p) / w, (-scale - p) / w).min(-1)
+                both = np.exp(-sigma * (t - t0 + out)[..., None]) * sigma * length / n
+                want += both * albedo * E * lobe(g, d @ w)[..., None]
+        m = media.homogeneous((-scale,) * 3, (scale,) * 3, sigma, albedo, phase=phase.henyey_greenstein(g))
+        scene = Scene(medium=m, lights=[lights.directional(*sun) for sun in suns])
+        picture = Path(spp=3000, max_depth=1, jitter=False).render(scene, c, seed=3)
+        # the midpoint rule is off by (3 / 200)^2 / 24 of what it adds up, single precision by less
+        assert_means(picture.rgb, picture.variance + (2e-5 * want) ** 2, want)
+        # alpha is in [0, 1] and t within the box's diagonal, 3.5: bounds of their standard deviations
+        assert np.abs(picture.alpha - (1 - T).mean(-1)).max() < 5 * 0.5 / 3000**0.5
+        assert np.abs(picture.distance - far).max() < 5 * 2.9 * scale / 3000**0.5
+
+
 def test_every_pixel_of_a_rough_grid_is_its_closed_form():
     """Few large cells without any symmetry, whose every corner counts: 1 - T of each pixel's ray, cell by cell."""
     rho = np.random.default_rng(5).random((4, 3, 5)) ** 3
