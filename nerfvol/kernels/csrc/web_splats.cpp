@@ -153,7 +153,7 @@ void nerfvol::prepare_splats(int first, int last) {
     }
     keep_band(f, 16.0f * float(first), 16.0f * float(last));
     sort_by_depth(f);
-    make_lists(f, TileGrid(gaussians.view));
+    make_lists(f, TileGrid(gaussians.view), 16 * gaussians.splats.n_blocks);
 }
 
 void nerfvol::draw_splats(int row) {
