@@ -50,7 +50,7 @@ class SplatConfig(Checked):
     most_ratio: Annotated[float, within(1.5, 1e6)] = 12.0
     """A Gaussian's longest scale over its second, at most: needles fit a photograph and spoil the views between."""
     grow_every: Count = 60
-    """Steps between two rounds of splitting and pruning."""
+    """Steps between two rounds of splitting and pruning; short runs take fewer, see splat_schedule."""
     prune_opacity: Share = 0.02
     """Gaussians below this opacity are removed at each round."""
     early_stop_eps: Annotated[float, within(0, 0.999)] = 3e-3

@@ -48,6 +48,13 @@ class Schedule:
             return False
         return progress >= self.ends[stage] or bool(self.steps) and steps >= self.steps[stage]
 
+    def grow_every(self, most: int) -> int:
+        """Steps between two rounds of growth, at most ``most``: a short run has few steps before its last size, in which what
+        is new must still be optimised, and then one large round is worth less than several small ones."""
+        if not self.steps:
+            return most
+        return min(most, max(FEWEST_BETWEEN_ROUNDS, sum(self.steps) // ROUNDS))
+
     def planned(self, start: int, progress: float) -> int:
         """Gaussians that there should be at ``progress`` where ``start`` were there first: exponential growth."""
         share = min(1.0, max(0.0, (progress - GROWTH_STARTS) / (self.grown - GROWTH_STARTS)))
@@ -56,6 +63,10 @@ class Schedule:
 
 GROWTH_STARTS = 0.03
 """Share of progress."""
+ROUNDS = 20
+"""Of growth and pruning, at least, before the last size; but each round moves all splats in memory, and needs ..."""
+FEWEST_BETWEEN_ROUNDS = 30
+"""... that many steps to pay."""
 
 
 def make_schedule(

@@ -149,7 +149,7 @@ class SplatTrainer:
         while self.schedule.is_over(self.stage, progress, self.steps_done - self.stage_began):
             self.photographs.drop(self.schedule.factors[self.stage])
             self.stage, self.stage_began = self.stage + 1, self.steps_done
-        if self.steps_done and self.steps_done % self.config.grow_every == 0:
+        if self.steps_done and self.steps_done % self.schedule.grow_every(self.config.grow_every) == 0:
             self.grow(progress)
         if self.appearance.due(progress):
             self.fit_appearance(progress)

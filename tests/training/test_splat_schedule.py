@@ -113,3 +113,13 @@ def test_a_checkpoint_without_a_schedule(change):
     for name in state:
         with pytest.raises(LookupError):
             saved_schedule({k: v for k, v in state.items() if k != name})
+
+
+def test_a_short_run_grows_in_more_rounds():
+    """6 s of 400x400 have 650 steps before the last size, a minute 3,200; where no step is bounded the setting stands."""
+    sizes = [(400, 400)] * 100
+    short, minute = (make_schedule(seconds, sizes, photographs=False) for seconds in (6.0, 60.0))
+    assert short.grow_every(60) == sum(short.steps) // 20 and 30 <= short.grow_every(60) <= 35
+    assert minute.grow_every(60) == 60 and short.grow_every(7) == 7
+    assert make_schedule(1.0, sizes, photographs=False).grow_every(60) == 30
+    assert Schedule((1,), (1.0,), 10, 0.5).grow_every(60) == 60
