@@ -116,7 +116,7 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
     if training is None:
         scene, cameras = convert.scene_around(model), convert.cameras_around(model)
     else:
-        scene, cameras = training.scene, convert.small_cameras(training.cameras)
+        scene, cameras = training.scene, convert.small_cameras(training.cameras, training.scene)
     config = Config(time_budget=options.time_budget, seed=options.seed)
     metadata = {k: v for k, v in model.metadata.items() if k in ("orbit", "provenance")} | {
         "background": list(background)

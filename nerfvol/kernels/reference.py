@@ -187,6 +187,8 @@ def distortion(weights: Tensor, middle: Tensor, length: Tensor, ray: Tensor, n_r
     return torch.stack(out)
 
 
+SPARSE_KNEE = 0.02
+"""Weight of a segment from which on more of it costs little in the sparsity term."""
 _EDGES = torch.tensor([(o ^ axis, o) for axis in (1, 2, 4) for o in range(8) if o & axis])
 _KNEE_DENSITY, _KNEE_COLOUR = 1.0, 0.1
 
@@ -213,7 +215,7 @@ def loss(
     """The training loss of a batch (see ops.LossOptions), a scalar, and a report.
 
     sum_rays weight * ( |C - target|^2 + colour * (sum_i w_i |c_i - target|^2 + T |background - target|^2)
-                        + distortion * L_distortion
+                        + distortion * L_distortion + sparsity * sum_i log(1 + w_i / SPARSE_KNEE)
                         + sum_i length_i / side_i (tv_density * roughness of density + tv_sh * of colour) ),
     distances of the distortion in root cubes; the last sum goes over the leaves that the ray crosses.
 
@@ -234,6 +236,8 @@ def loss(
         length = (s.segments.t_far - s.segments.t_near) / octree.size
         spread = distortion(s.weights, s.middle / octree.size, length, ray, n)
         total = total + options.distortion * spread
+    if options.sparsity > 0:
+        total = total + options.sparsity * _per_ray(n, ray, torch.log1p(s.weights / SPARSE_KNEE))
     if options.tv_density > 0 or options.tv_sh > 0:
         density, colour = roughness(octree, values, s.segments.leaf)
         side = torch.from_numpy(octree.leaf_sizes()).to(values.dtype)[s.segments.leaf]

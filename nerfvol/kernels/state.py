@@ -68,13 +68,15 @@ class LossOptions:
     """Weights of the loss's terms, see reference.loss for the formula; fields reach the kernels by their names.
 
     background: three floats behind the octree; colour: of what each segment misses the target by; distortion: of
-    Mip-NeRF 360's loss; tv_density, tv_sh: of the differences between a leaf's corners, in raw density and in SH
-    coefficients; early_stop_eps: a ray ends when its transmittance falls below.
+    Mip-NeRF 360's loss; sparsity: of the logarithms of the segments' weights; tv_density, tv_sh: of the differences
+    between a leaf's corners, in raw density and in SH coefficients; early_stop_eps: a ray ends when its transmittance
+    falls below.
     """
 
     background: Sequence[float] = WHITE
     colour: float = 0.0
     distortion: float = 0.0
+    sparsity: float = 0.0
     tv_density: float = 0.0
     tv_sh: float = 0.0
     early_stop_eps: float = DEFAULT_EARLY_STOP

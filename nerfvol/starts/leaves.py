@@ -54,8 +54,8 @@ class _Gaussians:
     @classmethod
     def of(cls, splats: Splats) -> _Gaussians:
         return cls(
-            splats.means + splats.origin, rotations(splats.quats), np.exp(splats.log_scales.astype(np.float64)),
-            1 / (1 + np.exp(-splats.logits.astype(np.float64))),
+            splats.means + splats.origin, np.ascontiguousarray(rotations(splats.quats)),
+            np.exp(splats.log_scales.astype(np.float64)), 1 / (1 + np.exp(-splats.logits.astype(np.float64))),
         )  # fmt: skip
 
     def __getitem__(self, chosen: NDArray) -> _Gaussians:
@@ -113,10 +113,19 @@ def _levels(g: _Gaussians, scene: SceneBounds, cameras: Sequence[Camera], level:
 def _filled(
     g: _Gaussians, levels: NDArray[np.int64], origin: Float, size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of a Gaussian and a cell that it fills: the Gaussian's number, the cell's level and Morton code, (m,) each."""
+    """Pairs of a Gaussian and a cell that it fills: the Gaussian's number, the cell's level and Morton code, (m,) each.
+
+    Compiled in the order of the Gaussians (csrc/around.cpp); the same pairs in any order in numpy.
+    """
     side = size / 2.0**levels
     half = g.reach[:, None] * np.hypot(g.scales, BLUR * side[:, None])  # so that thin discs are closed
     steps = np.ceil(half / (SPACING * side[:, None])).astype(np.int64)
+    compiled = native()
+    if compiled is not None:
+        which, code = compiled.fill_cells(
+            means=g.means, axes=g.axes, side=side, half=half, steps=steps, level=levels, origin=origin
+        )
+        return which, levels[which], code
     shapes, group = np.unique(steps, axis=0, return_inverse=True)
     order = np.argsort(group.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(group.reshape(-1), minlength=len(shapes)))
@@ -175,15 +184,7 @@ def _write(
     pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> None:
     """Density and colour of the leaves, and from them those of the vertices; ``pairs`` (levels, codes) fill the leaves."""
-    levels, codes = pairs
-    side = octree.size / 2.0**levels
-    centers = octree.origin + (demorton(codes) + 0.5) * side[:, None]
-    own = np.einsum("nij,ni->nj", g.axes[which], centers - g.means[which])
-    wide = g.scales[which] ** 2 + (BLUR * side[:, None]) ** 2
-    thickness = -np.log1p(-np.minimum(g.opacity[which], 0.99))
-    sigma = thickness / np.sqrt(2 * np.pi * wide.min(1)) * np.exp(-0.5 * (own**2 / wide).sum(1))
-    # A cell that was split: its density goes to the leaves in it that finer Gaussians fill as well.
-    leaf = _leaves_at(octree, levels, codes, centers)
+    leaf, sigma = _weighed(octree, g, which, *pairs)
     lies = np.flatnonzero(leaf >= 0)
     colours = np.column_stack([np.ones(len(sh)), sh]).astype(np.float64)  # the first column adds up the densities
     sums = _summed(colours, which[lies], sigma[lies], leaf[lies], octree.n_leaves)
@@ -199,17 +200,29 @@ def _write(
     octree.prefiltered = None
 
 
-def _leaves_at(
-    octree: Octree, levels: NDArray[np.int64], codes: NDArray[np.int64], centers: Float
-) -> NDArray[np.int64]:
-    """(m,) the leaf that holds the centre of each cell, -1: none; each cell is looked up once, however often it is named."""
-    keys = (levels << 58) | codes
-    order = np.argsort(keys)
-    ordered = keys[order]
-    first = np.concatenate([[True], ordered[1:] != ordered[:-1]])
-    leaf = np.empty(len(keys), np.int64)
-    leaf[order] = octree.query(centers[order[first]])[np.cumsum(first) - 1]
-    return leaf
+def _weighed(
+    octree: Octree, g: _Gaussians, which: NDArray[np.int64], levels: NDArray[np.int64], codes: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Float]:
+    """The leaf that each pair's cell lies in, -1: none, and the density of its Gaussian there, (m,) each.
+
+    A cell that was split: its density goes to the leaf at its middle, where finer Gaussians fill that as well.
+    """
+    thickness = -np.log1p(-np.minimum(g.opacity, 0.99))
+    compiled = native()
+    if compiled is not None:
+        leaf, sigma = np.empty(len(which), np.int64), np.empty(len(which))
+        compiled.weigh_cells(
+            node_mask=octree.node_mask, leaf_mask=octree.leaf_mask, first_node=octree.first_node, first_leaf=octree.first_leaf,
+            means=g.means, axes=g.axes, squares=g.scales**2, thickness=thickness, blur=BLUR, origin=octree.origin,
+            size=octree.size, gaussian=which, level=levels, code=codes, leaf=leaf, weight=sigma,
+        )  # fmt: skip
+        return leaf, sigma
+    side = octree.size / 2.0**levels
+    centers = octree.origin + (demorton(codes) + 0.5) * side[:, None]
+    own = np.einsum("nij,ni->nj", g.axes[which], centers - g.means[which])
+    wide = g.scales[which] ** 2 + (BLUR * side[:, None]) ** 2
+    sigma = thickness[which] / np.sqrt(2 * np.pi * wide.min(1)) * np.exp(-0.5 * (own**2 / wide).sum(1))
+    return octree.query(centers), sigma
 
 
 def _summed(rows: Float, of: NDArray[np.int64], weight: Float, to: NDArray[np.int64], n: int) -> Float:

@@ -34,7 +34,7 @@ from nerfvol.starts.leaves import PIXELS, octree_around
 from nerfvol.starts.subject import subject_of
 from nerfvol.starts.surfaces import Seen, write_surfaces
 from nerfvol.starts.surfels import surfels
-from nerfvol.starts.visible import judged_downscale, largest_weights
+from nerfvol.starts.visible import judged_downscale, largest_weights, thickness
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import Phase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
@@ -43,12 +43,14 @@ from nerfvol.views import SplatModel
 
 MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
-FITTED_VIEWS = 100
+FITTED_VIEWS, FITTED_VIEWS_OF_OBJECTS = 100, 50
 """Pictures of the splats that their octree is fitted to, at most."""
-FITTED_STEPS, FITTED_STEPS_OF_OBJECTS = 400, 240
+FITTED_STEPS, FITTED_STEPS_OF_OBJECTS = 400, 160
 """Steps of the fit: a few seconds on two cores. Objects begin with their surfaces found (starts/surfaces.py)."""
-LOOKS = 16
-"""Of these, those that tell surfaces from the free before the fit."""
+LOOKS = 32
+"""Looks that tell surfaces from the free before the fit."""
+EMPTY = 0.02
+"""Optical thickness along a leaf's side, at its densest corner, below which the leaf is left out before the fit."""
 FITTED_PIXELS = 400
 """Longer side, at most, of these pictures; of larger cameras a whole fraction."""
 VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
@@ -99,9 +101,10 @@ def scene_around(model: Model) -> SceneBounds:
     return SceneBounds(cube((low + high) / 2, 0.51 * float((high - low).max())), None, False)
 
 
-def small_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """At most FITTED_VIEWS of these, evenly chosen, of about FITTED_PIXELS pixels."""
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), FITTED_VIEWS)).round().astype(int))
+def small_cameras(cameras: Sequence[Camera], scene: SceneBounds) -> list[Camera]:
+    """As many of these as an octree is fitted to, evenly chosen, of about FITTED_PIXELS pixels."""
+    most = FITTED_VIEWS if scene.is_unbounded else FITTED_VIEWS_OF_OBJECTS
+    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), most)).round().astype(int))
     longest = max(max(c.intrinsics.width, c.intrinsics.height) for c in cameras)
     factor = max(1, -(-longest // FITTED_PIXELS))
     return [cameras[i].scaled(factor) if factor > 1 else cameras[i] for i in chosen]
@@ -121,6 +124,8 @@ def octree_of(
     octree = octree_around(splats, seen.scene, seen.cameras, level)
     if not seen.scene.is_unbounded:
         write_surfaces(octree, looked_at(SplatModel(splats), seen.cameras, background))
+        solid = thickness(octree) >= EMPTY
+        octree = octree.prune(solid)[0] if solid.any() else octree
     steps = FITTED_STEPS if seen.scene.is_unbounded else min(FITTED_STEPS, FITTED_STEPS_OF_OBJECTS)
     config = OctreeConfig(levels=[level], steps=steps, **FIT)
     trainer = OctreeTrainer(seen, background, config, seed, octree)
@@ -130,14 +135,16 @@ def octree_of(
 
 
 def looked_at(model: Model, cameras: Sequence[Camera], background: Sequence[float]) -> list[Seen]:
-    """What LOOKS of ``cameras``, evenly chosen, see of a model, with distances."""
+    """What LOOKS of ``cameras``, evenly chosen, see of a model, with distances, as pinholes."""
     views = []
     for i in np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), LOOKS)).round().astype(int)):
-        image = model.render(cameras[i], background, ("rgb", "opacity", "median_depth"))
+        lens = cameras[i].intrinsics
+        camera = cameras[i].through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
+        image = model.render(camera, background, ("rgb", "opacity", "median_depth"))
         opacity = image["opacity"]
         through = (1 - opacity)[..., None] * np.asarray(background, np.float32)
         rgb = (image["rgb"] - through) / np.maximum(opacity, 1 / 255)[..., None]
-        views.append(Seen(cameras[i], rgb, opacity, image["median_depth"]))
+        views.append(Seen(camera, rgb, opacity, image["median_depth"]))
     return views
 
 

@@ -244,6 +244,7 @@ class OctreeTrainer:
             background=self._random_background(),
             colour=c.colour_weight * fade,
             distortion=c.distortion * fade,
+            sparsity=self.chosen.sparsity,
             tv_density=self.chosen.tv_density * smooth,
             tv_sh=self.chosen.tv_sh * smooth,
             early_stop_eps=c.early_stop_eps,

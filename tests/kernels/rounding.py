@@ -172,10 +172,15 @@ def per_ray(t: Trace, x: np.ndarray) -> np.ndarray:
     return out
 
 
+def weight_bounds(t: Trace) -> np.ndarray:
+    """Largest allowed differences of the segments' weights: (n_segments,)."""
+    alpha = -np.expm1(-t.tau)
+    return t.d_before * alpha + t.before * (np.exp(-t.tau) * np.minimum(t.d_tau, 1) + 6 * U * alpha)
+
+
 def image_bounds(t: Trace, octree: Octree, background) -> dict[str, np.ndarray]:
     """Largest allowed differences of rgb (n, 3), trans, depth (n,) and normal (n, 3)."""
-    alpha = -np.expm1(-t.tau)
-    d_weight = t.d_before * alpha + t.before * (np.exp(-t.tau) * np.minimum(t.d_tau, 1) + 6 * U * alpha)
+    d_weight = weight_bounds(t)
     sums = 2 * U * (t.hits + 2)
     final = np.exp(-per_ray(t, t.tau))
     d_trans = final * (np.expm1(t.d_total) + sums) + t.ghost + 2 * U

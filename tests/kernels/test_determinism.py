@@ -18,7 +18,7 @@ def trained(seed: int, degree: int, steps: int = 4) -> tuple[Octree, ops.TrainSt
     rng = np.random.default_rng(seed)
     octree = random_octree("mixed", degree, rng)
     state = ops.TrainState(octree)
-    options = ops.LossOptions(BACKGROUND, colour=0.1, distortion=0.1, tv_density=0.01, tv_sh=0.01)
+    options = ops.LossOptions(BACKGROUND, colour=0.1, distortion=0.1, sparsity=0.01, tv_density=0.01, tv_sh=0.01)
     errors = []
     for _ in range(steps):
         o, d = camera_tiles(octree, rng, 24)

@@ -79,7 +79,7 @@ def test_gradcheck_of_the_images(degree):
 
 @pytest.mark.parametrize(
     "terms",
-    [{}, {"colour": 0.4}, {"distortion": 0.7}, {"tv_density": 0.3}, {"tv_sh": 0.3}],
+    [{}, {"colour": 0.4}, {"distortion": 0.7}, {"sparsity": 0.2}, {"tv_density": 0.3}, {"tv_sh": 0.3}],
     ids=lambda terms: next(iter(terms), "plain"),
 )
 def test_gradcheck_of_the_loss(terms):

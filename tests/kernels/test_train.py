@@ -22,8 +22,11 @@ LOSSES = {
     "plain": ops.LossOptions(BACKGROUND, early_stop_eps=0.0),
     "colour": ops.LossOptions(BACKGROUND, colour=0.3, early_stop_eps=0.0),
     "distortion": ops.LossOptions(BACKGROUND, distortion=0.5, early_stop_eps=0.0),
+    "sparse": ops.LossOptions(BACKGROUND, sparsity=0.05, early_stop_eps=0.0),
     "smooth": ops.LossOptions(BACKGROUND, tv_sh=0.1, early_stop_eps=0.0),
-    "all": ops.LossOptions(BACKGROUND, colour=0.1, distortion=0.2, tv_density=0.003, tv_sh=0.02, early_stop_eps=0.0),
+    "all": ops.LossOptions(
+        BACKGROUND, colour=0.1, distortion=0.2, sparsity=0.01, tv_density=0.003, tv_sh=0.02, early_stop_eps=0.0
+    ),
 }
 PIXEL_ANGLE = 0.01
 
@@ -66,6 +69,10 @@ def loss_bound(case: Case, loss: str) -> np.ndarray:
     # The moments in front and behind are sums and differences of up to `hits` numbers no larger than `farthest`.
     moments = 4 * (t.d_total + (t.hits + 4) * 4 * U)
     d_share += spread[t.ray] * moments[t.ray] + options.distortion * weight[t.ray] * 4 * t.d_middle / octree.size
+    # dL/dw of the sparsity falls as w grows.
+    falling = options.sparsity * weight[t.ray] / (reference.SPARSE_KNEE + t.weight)
+    share += falling
+    d_share += falling * (rounding.weight_bounds(t) / (reference.SPARSE_KNEE + t.weight) + 4 * U)
     q = np.abs(g @ np.array(BACKGROUND)) + options.colour * weight * ((BACKGROUND - target) ** 2).sum(1)
     d_q = 8 * U * q + d_g @ np.abs(BACKGROUND)
     np.maximum.at(q, t.ray, share)
@@ -89,7 +96,7 @@ def test_gradient_of_the_loss(isa, degree, loss):
     assert np.linalg.norm(bound) < 0.1 * np.linalg.norm(theirs)
 
 
-@pytest.mark.parametrize("term", ["colour", "distortion", "smooth"])
+@pytest.mark.parametrize("term", ["colour", "distortion", "sparse", "smooth"])
 def test_each_term_of_the_loss_has_a_gradient_that_the_bounds_would_miss_if_it_were_lost(term):
     case = Case("mixed", 1, 201, "odd", n=3, distance=(0.8, 1.3))
     lost = np.abs(true_loss_gradient(case, term) - true_loss_gradient(case, "plain"))
@@ -323,6 +330,7 @@ def test_the_loss_is_what_it_says():
         term += options.colour * (w @ ((c - target) ** 2).sum(1) + final * ((BACKGROUND - target) ** 2).sum())
         pairs = sum(w[i] * w[j] * abs(m[i] - m[j]) for i in range(len(w)) for j in range(len(w)))
         term += options.distortion * (pairs + (w * w * length).sum() / 3)
+        term += options.sparsity * np.log(1 + w / 0.02).sum()
         for i in np.flatnonzero(mine):
             for a, b in edges:
                 away = np.abs(corners[i, a] - corners[i, b])

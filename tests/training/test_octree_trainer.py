@@ -218,7 +218,7 @@ def steps_taken(monkeypatch) -> list[ops.LossOptions]:
 def test_terms_of_the_loss_fade_and_smoothness_waits(tiny_scene, monkeypatch):
     config = OctreeConfig(
         levels=[3], downscales=[4], stage_ends=[1.0], tiles=[8], prunes=[0], colour_weight=0.5, distortion=0.25, tv_density=1.0,
-        tv_sh=2.0, tv_from=2, regulariser_decay=0.01,
+        tv_sh=2.0, tv_from=2, sparsity=0.75, regulariser_decay=0.01,
     )  # fmt: skip
     seen = steps_taken(monkeypatch)
     trainer = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None)
@@ -227,6 +227,7 @@ def test_terms_of_the_loss_fade_and_smoothness_waits(tiny_scene, monkeypatch):
     found = [(o.colour, o.distortion, o.tv_density, o.tv_sh) for o in seen]
     expected = [(0.5, 0.25, 0, 0), (0.05, 0.025, 0, 0), (0.05, 0.025, 0.1, 0.2), (0.005, 0.0025, 0.01, 0.02)]
     assert np.allclose(found, expected, rtol=1e-12, atol=0)
+    assert [o.sparsity for o in seen] == [0.75] * 4  # surfaces that are left alone become haze again
 
 
 def test_photographs_have_another_colour_behind_them_each_step(tiny_scene, monkeypatch):

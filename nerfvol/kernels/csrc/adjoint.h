@@ -148,7 +148,7 @@ struct Adjoint {
     float target[kTile][3], colour_weight[kTile], distortion_weight[kTile], error[kTile], ray_weight[kTile];
     float weight_sum[kTile], moment_sum[kTile];          // over all hits, for the distortion loss
     float weight_behind[kTile], moment_behind[kTile];
-    float tv_density = 0, tv_sh = 0;
+    float sparsity = 0, tv_density = 0, tv_sh = 0;
 };
 
 inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const RenderOptions& options, const PacketState<1>& s,
@@ -169,6 +169,7 @@ inline void adjoint_of_cotangents(const Tree& tree, const Cotangents& c, const R
 
 inline void adjoint_of_loss(const Loss& loss, const PacketState<1>& s, int64_t first, int n, Adjoint& a, StepReport& report) {
     const nerfvol::LossOptions& o = loss.options;
+    a.sparsity = o.sparsity;
     a.tv_density = o.tv_density;
     a.tv_sh = o.tv_sh;
     for (int l = 0; l < n; ++l) {
@@ -276,6 +277,8 @@ template <int B> void sum_pulls(const Pull<B>* pulls, int n, CornerRows<B>& to) 
     }
 }
 
+constexpr float kSparseKnee = 0.02f;     // e of the sparsity: a weight well above costs little more for growing
+
 // dL/d(r, g, b, raw density) of one hit; all hits of its ray behind it come first.
 inline f4 gradient_of_hit(const Hit& h, Adjoint& a, float per_length) {
     const int l = h.lane;
@@ -300,6 +303,7 @@ inline f4 gradient_of_hit(const Hit& h, Adjoint& a, float per_length) {
         a.weight_behind[l] = w_behind + w;
         a.moment_behind[l] = m_behind + w * m;
     }
+    q += a.sparsity * a.ray_weight[l] / (kSparseKnee + w);
     gradient[3] = (h.trans_after * q - a.behind[l]) * h.tau_slope;
     a.behind[l] += w * q;
     return gradient;

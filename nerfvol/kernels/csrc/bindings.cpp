@@ -23,6 +23,7 @@
 
 void bind_photographs(nanobind::module_& m);  // sweep_bindings.cpp
 void bind_distilling(nanobind::module_& m);   // distil_bindings.cpp
+void bind_around(nanobind::module_& m);       // around_bindings.cpp
 void bind_paths(nanobind::module_& m);        // path_bindings.cpp
 
 namespace nb = nanobind;
@@ -274,6 +275,7 @@ void bind_training(nb::module_& m) {
         .def_rw("early_stop_eps", &LossOptions::early_stop_eps)
         .def_rw("colour", &LossOptions::colour)
         .def_rw("distortion", &LossOptions::distortion)
+        .def_rw("sparsity", &LossOptions::sparsity)
         .def_rw("tv_density", &LossOptions::tv_density)
         .def_rw("tv_sh", &LossOptions::tv_sh);
     nb::class_<Rates>(m, "Rates")
@@ -309,6 +311,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.attr("MAX_LEVEL") = kMaxLevel;
     bind_photographs(m);
     bind_distilling(m);
+    bind_around(m);
     bind_paths(m);
     nb::class_<TreeArrays>(m, "Tree").def(
         "__init__", &init_tree,

@@ -11,14 +11,6 @@
 namespace nerfvol {
 namespace {
 
-uint64_t spread(uint64_t v) {  // bits of v to every third place
-    v = (v | v << 32) & 0x1F00000000FFFFull;
-    v = (v | v << 16) & 0x1F0000FF0000FFull;
-    v = (v | v << 8) & 0x100F00F00F00F00Full;
-    v = (v | v << 4) & 0x10C30C30C30C30C3ull;
-    return (v | v << 2) & 0x1249249249249249ull;
-}
-
 constexpr int kLatticeStride[3] = {9, 3, 1};
 
 bool is_lattice_corner(int place) { return (place / 9) % 2 == 0 && (place / 3) % 3 % 2 == 0 && place % 3 % 2 == 0; }
@@ -80,7 +72,7 @@ int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int m
                 }
                 uint64_t p[3];
                 for (int axis = 0; axis < 3; ++axis) p[axis] = uint64_t(ijk[3 * leaf + axis] + (o >> (2 - axis) & 1)) << shift;
-                const uint64_t key = spread(p[0]) << 2 | spread(p[1]) << 1 | spread(p[2]);
+                const uint64_t key = spread_bits(p[0]) << 2 | spread_bits(p[1]) << 1 | spread_bits(p[2]);
                 uint64_t s = slot_of(key);
                 while (table[s] >= 0 && keys[std::size_t(table[s])] != key) s = (s + 1) & uint64_t(capacity - 1);
                 if (table[s] < 0) {

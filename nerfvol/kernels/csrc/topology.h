@@ -6,6 +6,23 @@
 
 namespace nerfvol {
 
+// Bits of v < 2^20 to every third place, and back.
+inline uint64_t spread_bits(uint64_t v) {
+    v = (v | v << 32) & 0x1F00000000FFFFull;
+    v = (v | v << 16) & 0x1F0000FF0000FFull;
+    v = (v | v << 8) & 0x100F00F00F00F00Full;
+    v = (v | v << 4) & 0x10C30C30C30C30C3ull;
+    return (v | v << 2) & 0x1249249249249249ull;
+}
+inline uint64_t gather_bits(uint64_t v) {
+    v &= 0x1249249249249249ull;
+    v = (v | v >> 2) & 0x10C30C30C30C30C3ull;
+    v = (v | v >> 4) & 0x100F00F00F00F00Full;
+    v = (v | v >> 8) & 0x1F0000FF0000FFull;
+    v = (v | v >> 16) & 0x1F00000000FFFFull;
+    return (v | v >> 32) & 0x1FFFFFull;
+}
+
 // Place of a corner of a new leaf in the 3x3x3 lattice of the old leaf; octant < 0: the leaf is the old one itself.
 int lattice_place(int octant, int corner);
 

@@ -62,6 +62,7 @@ struct Cotangents {
 struct LossOptions : RenderOptions {
     float colour = 0;                            // weight of sum_i w_i |c_i - target|^2 + T |background - target|^2
     float distortion = 0;                        // weight of the distortion loss of Mip-NeRF 360 (distances in root cubes)
+    float sparsity = 0;                          // weight of sum_i log(1 + w_i / e): few segments, each with much of the light
     float tv_density = 0, tv_sh = 0;             // weights of differences between the corners of leaves (see add_variation)
 };
 struct Loss {
