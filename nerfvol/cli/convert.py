@@ -45,8 +45,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "result is compared with the model on their held-out views (default: those of the run; without any, "
                    "cameras all around)")  # fmt: skip
     p.add_argument("--downscale", metavar="N", help="area-average the images by N (default: that of the run, else 1)")
-    p.add_argument("--time-budget", metavar="TIME", help="train the result on the images for so long, such as 25s "
-                   "(default: not at all)")  # fmt: skip
+    p.add_argument("--time-budget", metavar="TIME", help="train the result on the images until so much is over for everything, "
+                   "such as 25s (default: not at all)")  # fmt: skip
     p.add_argument("--level", metavar="L", help="octree: finest leaves, 2^L along the scene (default: 1.4 pixels wide)")
     p.add_argument("--max-splats", metavar="N", help="splats: at most so many: the octree's finest level that has no more, "
                    "or, where they are trained, discs on what is seen (default: all visible leaves; 100000 discs)")  # fmt: skip
@@ -82,10 +82,9 @@ def run(options: ConvertOptions) -> int:
         raise InputError("--time-budget trains on images: say which with --data DIR")
     from nerfvol.datasets.load import load_dataset
 
-    training = None if data is None else load_dataset(data, "train", downscale)
-    model = _converted(options, target, training)
+    training, held_out = (None if data is None else load_dataset(data, split, downscale) for split in ("train", "val"))
+    model = _converted(options, target, training, 0 if held_out is None else len(held_out))
     _write(model, options, suffix)
-    held_out = None if data is None else load_dataset(data, "val", downscale)
     _say_cost(target, model, held_out)
     described = model.describe()
     size = f"{described['leaves']:,} leaves" if options.to == "octree" else f"{described['splats']:,} splats"
@@ -104,7 +103,8 @@ def _images_of(options: ConvertOptions) -> tuple[str | None, int]:
     return data, options.downscale or int(settings.get("downscale", 1))
 
 
-def _converted(options: ConvertOptions, target: Target, training: Dataset | None) -> Model:
+def _converted(options: ConvertOptions, target: Target, training: Dataset | None, scored: int) -> Model:
+    """``scored``: views that the result will be compared on."""
     from nerfvol.clouds import PointModel
     from nerfvol.config.training import Config
     from nerfvol.neural import FieldModel
@@ -126,24 +126,26 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
     trained = training is not None and options.time_budget is not None
     if options.to == "splats" and isinstance(model, OctreeModel) and not trained:
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
+    if isinstance(model, SplatModel | PointModel) and training is not None and trained:
+        # What pictures of the splats stand for is at hand.
+        octree = convert.surfaces_of(model.splats, scene, cameras, background, options.level)
+        return OctreeModel(convert.tuned_octree(octree, training, background, config, scored), metadata)
     seen = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, SplatModel | PointModel):
         octree = convert.octree_of(model.splats, seen, background, options.level, options.seed)
-        if training is not None and options.time_budget is not None:
-            octree = convert.tuned_octree(octree, training, background, config)
         return OctreeModel(octree, metadata)
     if isinstance(model, FieldModel):
         octree = convert.octree_of_field(model, seen, background, options.level)
         if options.to == "octree":
             if training is not None and options.time_budget is not None:
-                octree = convert.tuned_octree(octree, training, background, config)
+                octree = convert.tuned_octree(octree, training, background, config, scored)
             return OctreeModel(octree, metadata)
         model = OctreeModel(octree, metadata)
     assert isinstance(model, OctreeModel)
     if training is None or not trained:
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
     discs = convert.discs_of(model.octree, seen, background, options.max_splats)
-    tuned = convert.tuned_splats(discs, training, background, config)
+    tuned = convert.tuned_splats(discs, training, background, config, scored)
     return SplatModel(tuned.packed, {**metadata, **tuned.metadata})
 
 

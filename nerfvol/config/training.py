@@ -252,8 +252,8 @@ class OctreeConfig(Checked):
     distortion: Weight = 0.05
     """Weight of the distortion term at the start."""
     sparsity: Weight | None = None
-    """Weight of the logarithms of the segments' weights, from the first step to the last: haze on a ray costs as much as a
-    surface, so that what is left are surfaces, and rays with fewer segments. None: 0, and 3e-4 in photographs."""
+    """Weight of the logarithms of the segments' weights, reached where the rates begin to fall: haze on a ray costs as much as
+    a surface, so that what is left are surfaces, and rays with fewer segments. None: 0, and 3e-4 in photographs."""
     tv_density: Weight | None = None
     """Weight of differences of raw density between the corners of leaves (reference.roughness). None: 6e-5, and 2e-5 in
     photographs."""

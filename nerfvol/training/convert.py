@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -23,6 +22,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
+from nerfvol.machine import process_seconds
 from nerfvol.measure.scores import evaluate
 from nerfvol.models import Model
 from nerfvol.neural import FieldModel
@@ -36,7 +36,7 @@ from nerfvol.starts.surfaces import Seen, write_surfaces
 from nerfvol.starts.surfels import surfels
 from nerfvol.starts.visible import judged_downscale, largest_weights, thickness
 from nerfvol.training.octree_trainer import OctreeTrainer
-from nerfvol.training.phase import Phase
+from nerfvol.training.phase import FinalPhase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import SplatModel
@@ -45,8 +45,8 @@ MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
 FITTED_VIEWS, FITTED_VIEWS_OF_OBJECTS = 100, 50
 """Pictures of the splats that their octree is fitted to, at most."""
-FITTED_STEPS, FITTED_STEPS_OF_OBJECTS = 400, 160
-"""Steps of the fit: a few seconds on two cores. Objects begin with their surfaces found (starts/surfaces.py)."""
+FITTED_STEPS = 160
+"""Steps of the fit, which begins with the surfaces found (starts/surfaces.py): some two seconds on two cores."""
 LOOKS = 32
 """Looks that tell surfaces from the free before the fit."""
 EMPTY = 0.02
@@ -58,6 +58,8 @@ VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
 MOST_LEVEL = 10
 FINE_STEPS = 1500
 """Steps on photographs where no time is given."""
+LOOK_AGAIN, RESERVE_SHARE = 0.08, 0.3
+"""Shares of a time budget: after the first, what comes after the training is measured anew; it is given the second at most."""
 
 FIT = {
     "downscales": [1], "stage_ends": [1.0], "tiles": [320], "prunes": [1], "prune_steps": 20, "foreground_share": 0.9,
@@ -120,18 +122,26 @@ def octree_of(
     Raises:
         InputError: no splat lies in the scene's region, or none is seen.
     """
-    level = finest_level(seen) if level is None else level
-    octree = octree_around(splats, seen.scene, seen.cameras, level)
-    if not seen.scene.is_unbounded:
-        write_surfaces(octree, looked_at(SplatModel(splats), seen.cameras, background))
-        solid = thickness(octree) >= EMPTY
-        octree = octree.prune(solid)[0] if solid.any() else octree
-    steps = FITTED_STEPS if seen.scene.is_unbounded else min(FITTED_STEPS, FITTED_STEPS_OF_OBJECTS)
-    config = OctreeConfig(levels=[level], steps=steps, **FIT)
+    level = finest_level(seen.scene, seen.cameras) if level is None else level
+    octree = surfaces_of(splats, seen.scene, seen.cameras, background, level)
+    config = OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT)
     trainer = OctreeTrainer(seen, background, config, seed, octree)
-    for step in range(steps):
-        trainer.step(step / steps)
+    for step in range(FITTED_STEPS):
+        trainer.step(step / FITTED_STEPS)
     return trainer.octree
+
+
+def surfaces_of(
+    splats: Splats, scene: SceneBounds, cameras: Sequence[Camera], background: Sequence[float], level: int | None = None
+) -> Octree:
+    """The octree of splats before any fit: leaves around them, dense where the cameras see surfaces and nowhere else.
+
+    level: as in :func:`octree_of`, which raises the same.
+    """
+    octree = octree_around(splats, scene, cameras, finest_level(scene, cameras) if level is None else level)
+    write_surfaces(octree, looked_at(SplatModel(splats), cameras, background))
+    solid = thickness(octree) >= EMPTY
+    return octree.prune(solid)[0] if solid.any() else octree
 
 
 def looked_at(model: Model, cameras: Sequence[Camera], background: Sequence[float]) -> list[Seen]:
@@ -176,40 +186,53 @@ def discs_of(octree: Octree, seen: Dataset, background: Sequence[float], most: i
 
 
 def tuned_octree(
-    octree: Octree, dataset: Dataset, background: Sequence[float], config: Config, say: Say = print
+    octree: Octree, dataset: Dataset, background: Sequence[float], config: Config, scored: int = 0, say: Say = print
 ) -> Octree:
-    """An octree trained further on photographs, for ``config.time_budget`` seconds or FINE_STEPS steps."""
+    """An octree trained further on photographs until ``config.time_budget``, FINE_STEPS steps where there is none.
+
+    The budget counts from the start of the process; writing, and scoring ``scored`` views with both models, lie within it.
+    """
     settings = dataclasses.replace(config.octree, steps=FINE_STEPS)
     trainer = OctreeTrainer(dataset, background, settings, config.seed, octree)
-    _run(trainer, config.time_budget, FINE_STEPS, say)
+    _run(trainer, dataset.cameras[0], config.time_budget, scored, say)
     return trainer.finish()
 
 
 def tuned_splats(
-    splats: Splats, dataset: Dataset, background: Sequence[float], config: Config, say: Say = print
+    splats: Splats, dataset: Dataset, background: Sequence[float], config: Config, scored: int = 0, say: Say = print
 ) -> SplatModel:
-    """Splats trained further on photographs, for ``config.time_budget`` seconds or FINE_STEPS steps."""
+    """Splats trained further on photographs; as :func:`tuned_octree`."""
     photographs = Photographs(dataset, background)
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
-    seconds = config.time_budget or FINE_STEPS * SECONDS_PER_STEP
-    schedule = make_schedule(seconds, sizes, dataset.scene.is_unbounded, config.splats.max_splats)
+    left = None if config.time_budget is None else max(config.time_budget - process_seconds(), 1.0)
+    schedule = make_schedule(
+        left or FINE_STEPS * SECONDS_PER_STEP, sizes, dataset.scene.is_unbounded, config.splats.max_splats
+    )
     schedule = dataclasses.replace(schedule, most=max(schedule.most, splats.n))
     settings = config.splats.for_scene(dataset.scene)
     splats = splats.with_sh_degree(settings.sh_degree or 0)
     distance = subject_of(dataset).distance
     trainer = SplatTrainer(photographs, splats, settings, schedule, distance, background, config.seed)
-    _run(trainer, config.time_budget, FINE_STEPS, say)
+    _run(trainer, dataset.cameras[0], config.time_budget, scored, say)
     return trainer.take_model({})
 
 
-def _run(phase: Phase, seconds: float | None, steps: int, say: Say) -> None:
-    """A phase's steps, by the clock or counted."""
-    started, done, progress = time.perf_counter(), 0, 0.0
+def _run(phase: FinalPhase, camera: Camera, budget: float | None, scored: int, say: Say) -> None:
+    """A phase's steps, one at least: FINE_STEPS, or until the budget; what comes after them is measured on ``camera``."""
+    begun, done, progress, looked, after = process_seconds(), 0, 0.0, -math.inf, 0.0
     while progress < 1:
+        if budget is not None and process_seconds() - looked >= LOOK_AGAIN * budget:
+            looked = process_seconds()
+            phase.picture(camera)
+            after = phase.seconds_to_write() + 1.1 * scored * (process_seconds() - looked)
+            after = min(after, RESERVE_SHARE * budget)
         phase.step(progress)
         done += 1
-        progress = done / steps if seconds is None else (time.perf_counter() - started) / seconds
+        left = None if budget is None else budget - after - begun
+        progress = done / FINE_STEPS if left is None else (process_seconds() - begun) / left if left > 0 else 1.0
     say(f"trained {done} steps on the photographs: {phase.size()}")
+    if (sentence := phase.outcome()) is not None:
+        say(sentence)
 
 
 def cost(a: Model, b: Model, views: Dataset, background: Sequence[float]) -> tuple[float, float]:
@@ -218,10 +241,9 @@ def cost(a: Model, b: Model, views: Dataset, background: Sequence[float]) -> tup
     return cast(float, first), cast(float, second)
 
 
-def finest_level(dataset: Dataset) -> int:
+def finest_level(scene: SceneBounds, cameras: Sequence[Camera]) -> int:
     """Level whose leaves are about PIXELS wide at the scene's middle for the nearest camera, at most MOST_LEVEL."""
-    center, side = dataset.scene.center, dataset.scene.side
     pixel = min(
-        float(np.linalg.norm(c.position - center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in dataset.cameras
+        float(np.linalg.norm(c.position - scene.center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras
     )
-    return int(np.clip(round(math.log2(side / (PIXELS * pixel))), 5, MOST_LEVEL))
+    return int(np.clip(round(math.log2(scene.side / (PIXELS * pixel))), 5, MOST_LEVEL))

@@ -244,7 +244,7 @@ class OctreeTrainer:
             background=self._random_background(),
             colour=c.colour_weight * fade,
             distortion=c.distortion * fade,
-            sparsity=self.chosen.sparsity,
+            sparsity=self.chosen.sparsity * min(1.0, progress / max(self.chosen.decay_from, 1e-9)),
             tv_density=self.chosen.tv_density * smooth,
             tv_sh=self.chosen.tv_sh * smooth,
             early_stop_eps=c.early_stop_eps,
