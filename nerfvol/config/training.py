@@ -306,13 +306,16 @@ class OctreeConfig(Checked):
 
         Where nobody chose the stages, none averages pictures below SMALLEST_PICTURE: the rays of a tile of 4x4-pixel pictures
         cover the whole field of view, which makes a step ten times as long and teaches nothing. Nor are leaves asked for that
-        are smaller than half a pixel, and of stages that become alike the last is left, with one pruning each before it.
+        are smaller than half a pixel, and of stages that become alike the last is left, with one pruning each before it. Larger
+        pictures than the stages were made for have stages of finer leaves after them, in a half of what the last one had, each.
         """
         plain = OctreeConfig()
         names = ("levels", "downscales", "stage_ends", "tiles", "prunes")
         most = max(1, side // SMALLEST_PICTURE)
-        if any(getattr(self, name) != getattr(plain, name) for name in names) or most >= max(self.downscales):
+        if any(getattr(self, name) != getattr(plain, name) for name in names):
             return self
+        if most >= max(self.downscales):
+            return self._with_levels_to(min(finest_level(side), FINEST_LEVEL))
         factor, level = 1 << (most.bit_length() - 1), max(self.levels[0], finest_level(side))
         rows = [(min(row[0], level), min(row[1], factor), *row[2:])
                 for row in zip(*(getattr(self, name) for name in names), strict=True)]  # fmt: skip
@@ -322,6 +325,18 @@ class OctreeConfig(Checked):
         columns = {name: [row[i] for row in kept] for i, name in enumerate(names)}
         columns["prunes"] = [min(n, 1) for n in columns["prunes"][:-1]] + columns["prunes"][-1:]
         return dataclasses.replace(self, **columns)
+
+    def _with_levels_to(self, finest: int) -> OctreeConfig:
+        """The same with one more stage for each level after the last one's, to ``finest``."""
+        levels, ends = [*self.levels], [*self.stage_ends]
+        for level in range(levels[-1] + 1, finest + 1):
+            levels.append(level)
+            ends[-1:] = [(([0.0, *ends])[-2] + 1) / 2, 1.0]
+        more = len(levels) - len(self.levels)
+        again = {
+            name: [*getattr(self, name), *getattr(self, name)[-1:] * more] for name in ("downscales", "tiles", "prunes")
+        }
+        return dataclasses.replace(self, levels=levels, stage_ends=ends, **again) if more else self
 
 
 def finest_level(side: int) -> int:

@@ -26,7 +26,7 @@ from nerfvol.machine import return_free_memory
 from nerfvol.measure.leaf_width import visible_widths
 from nerfvol.octree import codec
 from nerfvol.octree.rows import convert_rows, sh_slots
-from nerfvol.octree.topology import Transfer
+from nerfvol.octree.topology import MAX_LEVEL, Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.starts.fog import low_density_octree
 from nerfvol.starts.visible import ENOUGH_VIEWS, solid
@@ -311,7 +311,8 @@ class OctreeTrainer:
         """
         c, level = self.config, self.config.levels[self.stage]
         split = footprint > (c.subdivide_pixels if level >= FINE_LEVEL else c.whole_pixels)
-        split &= self.octree.leaf_level < self.dataset.scene.finest_levels(self.octree.leaf_centers(), level)
+        finest = self.dataset.scene.finest_levels(self.octree.leaf_centers(), level)
+        split &= self.octree.leaf_level < np.minimum(finest, MAX_LEVEL)
         split &= holds_share(error, share)
         split = splits_within(split, error, self.max_leaves)
         return self._change(*self.octree.subdivide(split)) if split.any() else None

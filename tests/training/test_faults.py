@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfvol.config.training import Config, OctreeConfig
+from nerfvol.config.training import FINEST_LEVEL, Config, OctreeConfig, finest_level
 from nerfvol.datasets.fingerprint import changes, fingerprint
 from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.load import load_dataset
@@ -167,15 +167,23 @@ def test_pictures_do_not_depend_on_where_the_scene_lies(dataset, scale, shift):
     np.testing.assert_allclose(far["depth"] / scale, plain["depth"], atol=1e-3)
 
 
-@pytest.mark.parametrize("side", [8, 24, 72, 100, 200, 400, 800, 4000])
+@pytest.mark.parametrize("side", [8, 24, 72, 100, 200, 400, 800, 1080, 4000])
 def test_stages_suit_the_pictures(side):
-    """Nobody averages pictures below 24 pixels; stages agree with one another; large pictures have the plain schedule."""
+    """Nobody averages pictures below 24 pixels; stages agree with one another; large pictures have the plain schedule, larger
+    ones that and stages of finer leaves, down to half a pixel, in the time of the last one."""
     config = OctreeConfig().for_pictures(side)
     assert max(config.downscales) == 1 or side // max(config.downscales) >= 24
     assert config.downscales[-1] == 1 and config.stage_ends[-1] == 1
     rows = list(zip(config.levels, config.downscales, strict=True))
     assert len(set(rows)) == len(rows) or side >= 400
-    assert (config == OctreeConfig()) == (side >= 400)
+    assert (config == OctreeConfig()) == (400 <= side < 1024)
+    if side >= 1024:
+        plain, finest = OctreeConfig(), min(finest_level(side), FINEST_LEVEL)
+        assert (
+            config.levels == plain.levels + list(range(11, finest + 1))
+            and config.stage_ends[:6] == plain.stage_ends[:6]
+        )
+        config.check()
     mine = OctreeConfig(downscales=[8, 8, 4, 2, 1, 1, 1])
     assert mine.for_pictures(side) is mine
 
