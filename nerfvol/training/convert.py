@@ -139,7 +139,7 @@ def surfaces_of(
     level: as in :func:`octree_of`, which raises the same.
     """
     octree = octree_around(splats, scene, cameras, finest_level(scene, cameras) if level is None else level)
-    write_surfaces(octree, looked_at(SplatModel(splats), cameras, background))
+    write_surfaces(octree, looked_at(SplatModel(splats), small_cameras(cameras, scene), background))
     solid = thickness(octree) >= EMPTY
     return octree.prune(solid)[0] if solid.any() else octree
 
