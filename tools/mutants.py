@@ -139,7 +139,7 @@ MUTANTS = (
     M("nerfvol/training/octree_schedule.py", "for kept in (before, before[::2], before[:1]):", "for kept in (before,):", "training/test_octree_schedule.py", "a short run stays in its coarse stages"),
     M("nerfvol/training/octree_schedule.py", "    if is_unbounded:\n        return as_set\n", "", "training/test_octree_schedule.py", "haze between photographs is pruned once"),
     M("nerfvol/training/octree_schedule.py", "for prunes in (config.prunes, once):", "for prunes in (once,):", "training/test_octree_schedule.py", "a long run has another schedule than the one set"),
-    M("nerfvol/training/octree_trainer.py", "* (1 + self.config.final_prune_loss)", "* (1 - self.config.final_prune_loss)", "training/test_octree_trainer.py", "a last pruning that must gain"),
+    M("nerfvol/training/octree_end.py", "* (1 + loss)", "* (1 - loss)", "training/test_octree_trainer.py", "a last pruning that must gain"),
     M("nerfvol/training/octree_trainer.py", "            needed |= solid(self.octree)", "            pass", "training/test_octree_trainer.py", "few views judge what is solid"),
     M("nerfvol/training/octree_trainer.py", "if not self.dataset.scene.is_unbounded:\n            return self.background", "if True:\n            return self.background", "training/test_octree_trainer.py", "one colour behind photographs"),
     # ---------------------------------------------------------------- splats and exports

@@ -32,6 +32,7 @@ from nerfvol.starts.fog import low_density_octree
 from nerfvol.starts.visible import ENOUGH_VIEWS, solid
 from nerfvol.training.appearance import Appearance, small_picture
 from nerfvol.training.memory import OctreePlan, splits_within
+from nerfvol.training.octree_end import FINAL_PRUNE_WEIGHTS, FINAL_TILES, outcome, pruned_at_the_end
 from nerfvol.training.octree_schedule import (
     FINE_LEVEL,
     Stages,
@@ -58,12 +59,6 @@ MOST_LEVELS_AT_ONCE = 2
 """Where stages are left out: more would split haze that was never pruned."""
 BETA = 0.98
 """Memory, per step, of RMSprop's second moments."""
-FINAL_PRUNE_WEIGHTS = (0.04, 0.02, 0.01)
-"""At the end: the first of these at which pruning costs no more than ``final_prune_loss``."""
-FINAL_TILES = 4096
-"""Training tiles on which the final pruning is judged: 0.4 of an 800x800 picture."""
-SHARP = 2.0
-"""Pixels: where the leaves that are seen are no wider, finer ones show little more: a trilinear field has a period of two."""
 
 
 class OctreeTrainer:
@@ -159,13 +154,7 @@ class OctreeTrainer:
         widths = visible_widths(self.octree, self.dataset.cameras)
         if not len(widths):
             return None
-        steps: dict[int, int] = {}
-        for factor, n in zip(self.config.downscales, self.stage_steps.tolist(), strict=True):
-            steps[factor] = steps.get(factor, 0) + n
-        sizes = ", ".join(f"{n:,} on {'whole images' if k == 1 else f'images /{k}'}" for k, n in steps.items() if n)
-        middle, wide = np.percentile(widths, (50, 95))
-        pays = "finer ones would show more: more time would pay" if middle > SHARP else "more time would sharpen little"
-        return f"steps: {sizes}; the leaves that are seen are {middle:.1f} pixels wide (95 %: up to {wide:.1f}): {pays}"
+        return outcome(widths, self.config.downscales, self.stage_steps)
 
     def take_model(self, metadata: dict[str, Any]) -> OctreeModel:
         """The finished octree; tiles, moments and statistics are released."""
@@ -402,7 +391,7 @@ class OctreeTrainer:
     def finish(self) -> Octree:
         """The octree without the leaves that no picture misses: see FINAL_PRUNE_WEIGHTS. Ends the training.
 
-        A second octree is in memory while they are compared; moments and tiles are released before.
+        Moments and tiles are released before: a second octree is in memory while they are compared.
         """
         if self.bank is None or not self._seen_enough():
             return self.octree
@@ -414,21 +403,7 @@ class OctreeTrainer:
         self.bank = None
         del self.state, tiles
         return_free_memory()
-        most = self._squared_error(self.octree, batch) * (1 + self.config.final_prune_loss)
-        for keep in needed:
-            if not keep.any():
-                continue
-            pruned = None  # one at a time
-            pruned = self.octree.prune(keep)[0]
-            if self._squared_error(pruned, batch) <= most:
-                return pruned
-        return self.octree
-
-    def _squared_error(self, octree: Octree, batch: ops.Batch) -> float:
-        """Sum over the batch's rays, with their weights, of the squared error of the colours as they are shown."""
-        image = ops.render_rays(octree, batch.rays_o, batch.rays_d, self.background, outputs=("rgb",))["rgb"]
-        difference = np.clip(image, 0, 1) - batch.target
-        return float((difference**2).sum(1, dtype=np.float64) @ batch.weight)
+        return pruned_at_the_end(self.octree, needed, batch, self.background, self.config.final_prune_loss)
 
     def _change(self, octree: Octree, transfer: Transfer) -> Transfer:
         self.octree = octree  # the old values go before the moments follow
