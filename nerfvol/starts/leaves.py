@@ -37,6 +37,8 @@ LARGEST_LATTICE = 12
 """Samples to each side along an axis of a Gaussian, at most: its leaves are coarser where that is not enough."""
 BLUR = 0.35
 """Of a leaf's side: what a Gaussian's deviations are widened by, in squares, where leaves sample it."""
+PAIRS = 1 << 21
+"""Of a Gaussian and a cell, which are weighed at a time."""
 _THICKEST = 4.0  # optical thickness of one leaf at the start: beyond, no gradient passes
 
 Float = NDArray[np.float64]
@@ -184,15 +186,20 @@ def _write(
     pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> None:
     """Density and colour of the leaves, and from them those of the vertices; ``pairs`` (levels, codes) fill the leaves."""
-    leaf, sigma = _weighed(octree, g, which, *pairs)
-    lies = np.flatnonzero(leaf >= 0)
+    levels, codes = pairs
     colours = np.column_stack([np.ones(len(sh)), sh]).astype(np.float64)  # the first column adds up the densities
-    sums = _summed(colours, which[lies], sigma[lies], leaf[lies], octree.n_leaves)
+    sums = np.zeros((octree.n_leaves, colours.shape[1]))
+    for start in range(0, len(which), PAIRS):  # a million Gaussians fill 20 million cells
+        part = slice(start, start + PAIRS)
+        leaf, sigma = _weighed(octree, g, which[part], levels[part], codes[part])
+        lies = np.flatnonzero(leaf >= 0)
+        _add(colours, which[part][lies], sigma[lies], leaf[lies], sums)
     share = np.column_stack([np.ones(len(sums)), sums[:, 1:] / np.maximum(sums[:, :1], 1e-12)])
     held = np.minimum(sums[:, 0], _THICKEST / octree.leaf_sizes())
     corner, leaves = octree.corners.reshape(-1).astype(np.int64), np.repeat(np.arange(octree.n_leaves), 8)
     count = np.bincount(corner, minlength=octree.n_vertices)
-    values = _summed(share, leaves, held[leaves], corner, octree.n_vertices)
+    values = np.zeros((octree.n_vertices, share.shape[1]))
+    _add(share, leaves, held[leaves], corner, values)
     total = values[:, 0]
     octree.values[:, sh_slots(octree.sh_degree).reshape(-1)] = values[:, 1:] / np.maximum(total, 1e-12)[:, None]
     raw = explin_inverse(np.maximum(total / count / octree.density_scale, 1e-30))
@@ -225,11 +232,11 @@ def _weighed(
     return octree.query(centers), sigma
 
 
-def _summed(rows: Float, of: NDArray[np.int64], weight: Float, to: NDArray[np.int64], n: int) -> Float:
-    """(n, width) sums of ``weight`` (m,) times the rows (any, width) numbered ``of`` (m,), each into the row ``to`` (m,)."""
+def _add(rows: Float, of: NDArray[np.int64], weight: Float, to: NDArray[np.int64], sums: Float) -> None:
+    """Adds ``weight`` (m,) times the rows (any, width) numbered ``of`` (m,) to the rows ``to`` (m,) of ``sums`` (n, width)."""
     compiled = native()
     if compiled is not None:
-        sums = np.zeros((n, rows.shape[1]))
         compiled.add_rows(np.ascontiguousarray(rows), of, weight, to, sums)
-        return sums
-    return np.stack([np.bincount(to, weight * column[of], n) for column in rows.T], 1).astype(np.float64)
+        return
+    for column, total in zip(rows.T, sums.T, strict=True):
+        total += np.bincount(to, weight * column[of], len(sums))
