@@ -253,7 +253,7 @@ class OctreeConfig(Checked):
     """Weight of the distortion term at the start."""
     sparsity: Weight | None = None
     """Weight of the logarithms of the segments' weights, reached where the rates begin to fall: haze on a ray costs as much as
-    a surface, so that what is left are surfaces, and rays with fewer segments. None: 0, and 6e-4 in photographs."""
+    a surface, so that what is left are surfaces, and rays with fewer segments. None: 0, and 1.2e-3 in photographs."""
     tv_density: Weight | None = None
     """Weight of differences of raw density between the corners of leaves (reference.roughness). None: 6e-5, and 2e-5 in
     photographs."""
@@ -347,7 +347,7 @@ def finest_level(side: int) -> int:
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,
            "sparsity": 0.0, "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000}  # fmt: skip
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
-               "sparsity": 6e-4, "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
+               "sparsity": 1.2e-3, "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
 """Settings of an octree where nothing else is said."""
 FEW_VIEWS = {"tv_density": 3e-4, "tv_sh": 3e-4, "tv_from": 0}
 """... and of an object that few views show, which begins as a field (docs/experiments.md)."""
