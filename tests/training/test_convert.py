@@ -108,3 +108,40 @@ def test_cameras_all_around_see_all_of_it():
     directions = np.stack([c.position for c in around]) - discs.aabb().mean(0)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     assert np.abs(directions.mean(0)).max() < 0.02
+
+
+class Ticking:
+    """A phase on a clock of its own: a step takes a second, a picture two, writing three."""
+
+    def __init__(self, now: float) -> None:
+        self.now, self.progress = now, []
+
+    def picture(self, camera):
+        self.now += 2
+
+    def seconds_to_write(self) -> float:
+        return 3.0
+
+    def step(self, progress):
+        self.now += 1
+        self.progress.append(progress)
+
+    def size(self) -> str:
+        return "nothing"
+
+    def outcome(self) -> None:
+        return None
+
+
+@pytest.mark.parametrize("begun, ends", [(10.0, 40 - 3 - 1.1 * 2 * 2), (50.0, None)])
+def test_a_time_budget_is_that_of_the_whole_command(monkeypatch, begun, ends):
+    """What came before the training counts, and what comes after it, writing and two views to score, is kept: it is over at
+    most a step and a look at a picture later. Where nothing is left there is one step."""
+    phase = Ticking(begun)
+    monkeypatch.setattr(convert, "process_seconds", lambda: phase.now)
+    convert._run(phase, cameras(1, 0)[0], 40.0, 2, lambda sentence: None)
+    assert phase.progress[0] == 0
+    if ends is None:
+        assert len(phase.progress) == 1
+    else:
+        assert ends <= phase.now < ends + 3 and phase.progress == sorted(phase.progress) and phase.progress[-1] > 0.8
