@@ -97,6 +97,20 @@ def test_haze_that_is_gone_does_not_stay_occupied(compiled, dataset: Dataset) ->
     assert (grid.sigmas[:half] == 50.0).all() and (grid.sigmas[half:] == np.float32(1e-3)).all()
 
 
+def test_a_picture_is_drawn_anew_where_cells_change_and_not_where_rays_do(compiled, dataset: Dataset) -> None:
+    """A run asks ``size`` whether what scoring takes must be measured again; of haze a picture takes as long as many steps."""
+    trainer = trainer_of(dataset)
+    trainer.final = True
+    asked = [(trainer.size(), trainer.n_rays) for _ in range(3) if trainer.step()]
+    assert len({rays for _, rays in asked}) == 3 and len({size for size, _ in asked}) == 1
+    trainer.steps_done = compiled_field.SETTLED
+    hazy = trainer.size()
+    trainer.occupancy.coarse[...] = 1  # one group of cells of 64
+    assert trainer.size() not in (hazy, asked[0][0])
+    trainer.final = False  # its octree will be scored
+    assert trainer.size() == asked[0][0]
+
+
 def test_a_checkpoint_of_another_network_is_refused(compiled, dataset: Dataset) -> None:
     state = trainer_of(dataset).state_dict()
     wider = dataclasses.replace(SMALL, shape=dataclasses.replace(SMALL.shape, width=24))
