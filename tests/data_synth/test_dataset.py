@@ -1,6 +1,7 @@
 """Cameras, pictures, the folder that is written, and the command line."""
 
 import ast
+import errno
 import inspect
 import json
 import os
@@ -441,3 +442,13 @@ def test_bad_cameras_are_refused():
         Camera(4, 4, 5.0, np.diag([1.0, 2.0, 1.0, 1.0]))
     with pytest.raises(InputError, match="focal"):
         Camera(4, 4, 0.0, np.eye(4))
+
+
+def test_what_the_system_refuses_names_the_file(tmp_path):
+    """And not the temporary one: a full disk names none."""
+    with pytest.raises(OSError, match="full") as raised, files.replacing(tmp_path / "a.json"):
+        raise OSError(errno.ENOSPC, "full")
+    assert raised.value.filename == str(tmp_path / "a.json")
+    with pytest.raises(OSError, match="No such file") as raised, files.replacing(tmp_path / "none" / "a.json") as path:
+        path.write_text("a")
+    assert raised.value.filename == str(tmp_path / "none" / "a.json")

@@ -1,5 +1,6 @@
 """A model in map coordinates, in millimetres or in huge units keeps its shape in every format that holds points."""
 
+import copy
 import json
 import struct
 from dataclasses import replace
@@ -72,6 +73,17 @@ def test_the_command_says_so(tmp_path, command):
     save_splats(tmp_path / "s.safetensors", far_splats(), {})
     code, out, err = command("export", tmp_path / "s.safetensors", "--out", tmp_path / "s.ply")
     assert code == 0 and "positions are written relative to (448263, 5411932, 300)" in out, (out, err)
+
+
+@pytest.mark.parametrize("far", [True, False])
+def test_a_place_that_a_format_rounds_is_told(tmp_path, command, sphere_octree, far):
+    from nerfvol.octree.io import save_octree
+
+    octree = copy.copy(sphere_octree)
+    octree.origin = sphere_octree.origin + far * UTM
+    save_octree(tmp_path / "o.safetensors", octree, {})
+    code, out, err = command("export", tmp_path / "o.safetensors", "--out", tmp_path / "o.nii", "--resolution", 4)
+    assert code == 0 and ("rounded, by up to 0.25 units" in out) == far, (out, err)
 
 
 @pytest.mark.parametrize("far", [True, False])
