@@ -13,19 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from data_synth import integrators, raycast, scenes
+from data_synth import integrators, raycast
 from data_synth.cameras import Camera
 from data_synth.jit import use_threads
-from data_synth.scene import Scene
-from data_synth.scenes.volumes import TISSUE, _head
+from data_synth.scenes.volumes import TISSUE, _head, phantom
 
 N, SIGMA, TOP = 256, 40.0, 4095  # samples along each side, 1/u at opacity 1, the largest value that VTK is given
 
 
 def vtk_window(values: np.ndarray, camera: Camera, step: float, threads: int) -> Any:
     """A window of VTK that shows ``values`` in the box -1..1 as ``camera`` sees them."""
-    import vtk
-    from vtk.util import numpy_support
+    import vtk  # pyright: ignore[reportMissingImports]  # for this alone
+    from vtk.util import numpy_support  # pyright: ignore[reportMissingImports]
 
     image = vtk.vtkImageData()
     image.SetDimensions(N, N, N)
@@ -67,8 +66,8 @@ def vtk_window(values: np.ndarray, camera: Camera, step: float, threads: int) ->
 
 def shown(window: Any) -> np.ndarray:
     """(H, W, 3) in [0, 1] of what a window shows."""
-    import vtk
-    from vtk.util import numpy_support
+    import vtk  # pyright: ignore[reportMissingImports]  # for this alone
+    from vtk.util import numpy_support  # pyright: ignore[reportMissingImports]
 
     grab = vtk.vtkWindowToImageFilter()
     grab.SetInput(window)
@@ -83,8 +82,7 @@ def shown(window: Any) -> np.ndarray:
 def main(size: int = 800, threads: int = 2) -> None:
     """Print medians of three, and how alike the pictures are."""
     use_threads(threads)
-    values, scene = np.ascontiguousarray(_head(N), np.float32), scenes.make("phantom", resolution=16)
-    assert isinstance(scene, Scene)
+    values, scene = np.ascontiguousarray(_head(N), np.float32), phantom(resolution=16)
     scene.classified = raycast.classified(values, (-1,) * 3, (1,) * 3, TISSUE, SIGMA)
     camera = scene.viewpoints.camera(-50.0, 20.0, size, size)
     window = vtk_window(values, camera, scene.classified.values.step, threads)
