@@ -18,7 +18,7 @@ PICTURES = {
     "cloud": f"cloud {TRACED} 480x360",
     "cumulonimbus": f"cumulonimbus {TRACED} 360x360",
     "stratus": f"stratus {TRACED} 640x400",
-    "cloudscape": f"cloudscape {TRACED} 640x400",
+    "cloudscape": "cloudscape --set detail=0 --set resolution=400 --integrator path --spp 48 --denoise --size 480x300",
     "explosion": f"explosion {TRACED} 360x360",
     "phantom": f"phantom {TRACED} 480x480",
     "smoke": f"smoke {TRACED} 480x480",

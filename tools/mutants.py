@@ -43,10 +43,7 @@ SCANS, FLAKES, FIELDS, CLOUDS, TOGETHER = (
     f"data_synth/test_plain.py::test_in_plain_python[plain_{name}.py]"
     for name in ("scans", "flakes", "fields", "clouds", "combined")
 )
-MAPPED, CARVED = (
-    "data_synth/test_gather.py::test_what_cannot_be_gathered_is_read_from_maps",
-    "data_synth/test_noise_clouds.py::test_the_clouds_of_a_landscape_are_carved_and_end_before_the_box_does",
-)
+CARVED = "data_synth/test_noise_clouds.py::test_the_clouds_of_a_landscape_are_carved_and_end_before_the_box_does"
 TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.py"
 SETS, EXPOSURES, POSE_MASKS = "datasets/test_dataset.py", "starts/test_exposures.py", "poses/test_masks.py"
 MUTANTS = (
@@ -342,17 +339,17 @@ MUTANTS = (
     M("data_synth/transfer.py", 'line.split("#")[0]', "line", SCANS, "comments"),
     M("data_synth/transfer.py", "if points[:, 1:].min() < 0 or points[:, 1:].max() > 1:", "if points[:, 1:].min() < 0:", SCANS, "opacities above 1"),
     M("data_synth/transfer.py", "if path.stat().st_size > LARGEST:", "if False:", SCANS, "transfer functions without end"),
-    M("data_synth/gather.py", "return samples and grey and distant", "return samples and distant", MAPPED, "coloured media are gathered by their red"),
-    M("data_synth/gather.py", "return samples and grey and distant", "return samples and grey", MAPPED, "lamps are gathered as if they were far away"),
-    M("data_synth/gather.py", "m.phase.kind < phases.SGGX_SPECULAR and m.columns.g < 0", "m.columns.g < 0", MAPPED, "microflakes are gathered"),
+    M("data_synth/gather.py", "return samples and grey and distant", "return samples and distant", TOGETHER, "coloured media are gathered by their red"),
+    M("data_synth/gather.py", "return samples and grey and distant", "return samples and grey", TOGETHER, "lamps are gathered as if they were far away"),
+    M("data_synth/gather.py", "m.phase.kind < phases.SGGX_SPECULAR and m.columns.g < 0", "m.columns.g < 0", TOGETHER, "microflakes are gathered"),
     M("data_synth/gather.py", "m.phase.kind < phases.SGGX_SPECULAR and m.columns.g < 0", "m.phase.kind < phases.SGGX_SPECULAR", TOGETHER, "a grid of g is gathered without it"),
     M("data_synth/gather.py", "m.kind == GRID and m.detail.octaves == 0 and", "m.kind == GRID and", TOGETHER, "detail is gathered without it"),
-    M("data_synth/gather.py", "and one_phase and not has_boundaries(w)", "and one_phase", "data_synth/test_gather.py data_synth/test_boundaries.py", "media in boundaries are gathered as if they filled their box"),
-    M("data_synth/gather.py", "m.detail.octaves == 0 and not is_large(m)", "m.detail.octaves == 0", "data_synth/test_gather.py data_synth/test_sparse_volumes.py", "large media are gathered densely"),
+    M("data_synth/gather.py", "and one_phase and not has_boundaries(w)", "and one_phase", TOGETHER, "media in boundaries are gathered as if they filled their box"),
+    M("data_synth/gather.py", "m.detail.octaves == 0 and not is_large(m)", "m.detail.octaves == 0", TOGETHER, "large media are gathered densely"),
     M("data_synth/gather.py", "return bool(np.any(eye < np.array(m.lo) - near) or", "return bool(np.all(eye < np.array(m.lo) - near) or", "data_synth/test_gather.py", "eyes beside the medium count as in it"),
     M("data_synth/compiled.py", "    if m.detail.octaves > 0:\n", "    if False:\n", TOGETHER, "the core draws clouds without their detail"),
     M("data_synth/compiled.py", "    if m.columns.width:\n", "    if False:\n", TOGETHER, "the core draws grids of colour without them"),
-    M("data_synth/compiled.py", "    if m.kind == FUNCTION:\n", "    if False:\n", CORE, "the core draws density functions"),
+    M("data_synth/compiled.py", "    if m.kind == FUNCTION:\n", "    if False:\n", TOGETHER, "the core draws density functions"),
     M("data_synth/compiled.py", "camera.fx, camera.fy, camera.cx, camera.cy", "camera.fx, camera.fy, camera.cy, camera.cx", CORE, "centres of pictures that are no squares"),
     M("data_synth/fields.py", "(r, mixed(x, n, column + 1, where), mixed(x, n, column + 2, where))", "(r, mixed(x, n, column + 2, where), mixed(x, n, column + 1, where))", FIELDS, "green and blue change places"),
     M("data_synth/fields.py", "eigvalsh(matrices(part.astype(float)))[..., -1]", "eigvalsh(matrices(part.astype(float)))[..., 0]", FIELDS, "the majorant of flakes is their least area"),

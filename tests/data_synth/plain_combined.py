@@ -120,7 +120,7 @@ def test_a_medium_of_many_keeps_all_that_it_has(fine):
             assert lookups.extinction(got, tuple(p), tuple(d)) == lookups.extinction(m, tuple(p), tuple(d))
 
 
-def test_the_fast_ways_leave_it_to_the_others(fine):
+def test_the_fast_ways_leave_it_to_the_others(fine, monkeypatch):
     sun = [lights.directional((0, 0, 1), 1.0)]
     plain = media.grid(DENSITY, *BOX)
     assert gather.possible(Scene(medium=plain, lights=sun).world())
@@ -131,6 +131,18 @@ def test_the_fast_ways_leave_it_to_the_others(fine):
     ):
         world = Scene(medium=m, lights=sun).world()
         assert not gather.possible(world) and compiled.unknown(world) == why
+    lamp = lights.point((0, 0, 3), 1.0)
+    for scene in (
+        Scene(medium=media.grid(DENSITY, *BOX, (1.0, 2.0, 3.0)), lights=sun), Scene(medium=plain, lights=[*sun, lamp]),
+        Scene(medium=media.grid(DENSITY, *BOX, phase=phase.microflakes(np.diag([1.0, 1.0, 0.3]))), lights=sun),
+        Scene(medium=None, media=[plain], lights=sun), Scene(medium=media.homogeneous(*BOX), lights=sun),
+    ):  # fmt: skip
+        assert not gather.possible(scene.world())
+    formula = media.procedural(lambda x, y, z: 1.0, *BOX, 1.0)
+    assert compiled.unknown(Scene(medium=formula, lights=sun).world()) == "a density function"
+    with monkeypatch.context() as patch:
+        patch.setattr(gather, "is_large", lambda m: True)
+        assert not gather.possible(Scene(medium=plain, lights=sun).world())
     thin = media.grid(DENSITY, *BOX, albedo=ALBEDO)
     assert gather.possible(Scene(medium=thin, lights=sun).world())
 
