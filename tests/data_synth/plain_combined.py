@@ -15,12 +15,14 @@ from data_synth import (
     lights,
     look_at,
     lookups,
+    materials,
     media,
     microflakes,
     noise,
     phase,
     pool,
     sggx,
+    surfaces,
     truth,
     volumes,
     weather,
@@ -131,11 +133,12 @@ def test_the_fast_ways_leave_it_to_the_others(fine, monkeypatch):
     ):
         world = Scene(medium=m, lights=sun).world()
         assert not gather.possible(world) and compiled.unknown(world) == why
-    lamp = lights.point((0, 0, 3), 1.0)
+    lamp, ball = lights.point((0, 0, 3), 1.0), surfaces.sphere(0, (0, 0, 0), 0.8)
     for scene in (
         Scene(medium=media.grid(DENSITY, *BOX, (1.0, 2.0, 3.0)), lights=sun), Scene(medium=plain, lights=[*sun, lamp]),
         Scene(medium=media.grid(DENSITY, *BOX, phase=phase.microflakes(np.diag([1.0, 1.0, 0.3]))), lights=sun),
-        Scene(medium=None, media=[plain], lights=sun), Scene(medium=media.homogeneous(*BOX), lights=sun),
+        Scene(medium=plain, bounded=True, shapes=[ball], materials=[materials.null()], lights=sun),
+        Scene(medium=media.homogeneous(*BOX), lights=sun),
     ):  # fmt: skip
         assert not gather.possible(scene.world())
     formula = media.procedural(lambda x, y, z: 1.0, *BOX, 1.0)
