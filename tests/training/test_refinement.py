@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics
-from nerfvol.cameras.motions import BETA1, moved
+from nerfvol.cameras.motions import BETA1, Motions, moved
 from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint
 from nerfvol.models import load_model
@@ -91,3 +91,16 @@ def test_a_resumed_run_has_the_same_poses(scenes, tmp_path):
 def test_an_octree_s_cameras_stay(scenes, tmp_path):
     with pytest.raises(InputError, match="--refine-poses moves cameras by the gradients of splats"):
         run(scenes[0], tmp_path / "run", refine_poses=True, representation="octree", init="direct")
+
+
+def test_the_scene_comes_back_with_its_cameras(scenes, tmp_path, monkeypatch):
+    """Refined cameras may turn, shift and scale together; the model that is saved is put where the given poses are."""
+    short = {"splats": {"steps": 30, "grow_every": 25, "max_splats": 800}, "refine_poses": True}
+    monkeypatch.setattr(Motions, "back", lambda self: (1.0, np.eye(3), np.zeros(3)))
+    stays = load_model(run(scenes[1], tmp_path / "stays", **short) / "splats.safetensors")
+    turn, shift = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.5, -1, 2])
+    monkeypatch.setattr(Motions, "back", lambda self: (2.0, turn, shift))
+    comes = load_model(run(scenes[1], tmp_path / "comes", **short) / "splats.safetensors")
+    before, after = (model.splats.means + model.splats.origin for model in (stays, comes))
+    assert np.abs(after - (2 * before @ turn.T + shift)).max() < 1e-5 * np.abs(before).max()
+    assert comes.metadata["refined_poses"] == pytest.approx(2 * stays.metadata["refined_poses"], rel=1e-12)
