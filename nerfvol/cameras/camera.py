@@ -268,6 +268,13 @@ class Camera:
         return camera
 
 
+class ShearedPose(InputError):
+    """A pose whose axes have several lengths, or are not at right angles.
+
+    That is a convention we misread, or a file somebody edited, and no odd frame among good ones: nothing is left out for it.
+    """
+
+
 def rigid_pose(c2w: ArrayLike) -> Float:
     """The (4, 4) float64 pose, with the nearest exact rotation, of a camera-to-world matrix (4, 4) or (3, 4).
 
@@ -293,7 +300,7 @@ def rigid_pose(c2w: ArrayLike) -> Float:
         error = np.abs(r.T @ r - np.eye(3)).max()
         lengths = np.linalg.norm(r, axis=0)
     if not error <= RIGID_TOLERANCE:
-        raise InputError(
+        raise ShearedPose(
             "a camera pose must be rigid (an orthonormal rotation and a translation), got a 3x3 part with columns of "
             f"lengths {_numbers(lengths)} that is orthonormal only to {error:.2g}"
         )

@@ -109,7 +109,7 @@ def read(folder: Path, split: str) -> Listing:
                 raise InputError(f"its camera {camera} is not in the model's cameras")
             c2w = poses.read(name, _pose(quaternion, translation))
         except InputError as error:
-            poses.leave_out(InputError(f"{source}, image {name}: {error}"))
+            poses.leave_out(type(error)(f"{source}, image {name}: {error}"))
             continue
         if c2w is not None:
             frames.append(Frame(name, path, c2w, calibrations[camera], masks.of(name, path)))

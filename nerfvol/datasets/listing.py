@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
-from nerfvol.cameras.camera import unscaled_pose
+from nerfvol.cameras.camera import ShearedPose, unscaled_pose
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.images import SUFFIXES
 from nerfvol.datasets.points import ModelPoints
@@ -65,7 +65,9 @@ class Poses:
         self.count = 0
 
     def leave_out(self, error: InputError) -> None:
-        """A frame that cannot be used, for the reason that ``error`` says."""
+        """A frame that cannot be used, for the reason that ``error`` says; a ShearedPose is raised again."""
+        if isinstance(error, ShearedPose):
+            raise error
         self.count += 1
         self.unusable.append(error)
 

@@ -54,7 +54,7 @@ def read(folder: Path, split: str) -> Listing:
             if c2w is not None:
                 frames.append(Frame(name, images / name, c2w, calibration, masks.of(name, images / name)))
         except InputError as error:
-            poses.leave_out(InputError(f"{path}, image {name}: {error}"))
+            poses.leave_out(type(error)(f"{path}, image {name}: {error}"))
     said += poses.messages() + masks.messages(frames)
     chosen, training, split_said = split_frames(frames, split, [folder])
     depths = rows[(rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & (rows[:, 16] < 1e15), 15:]

@@ -122,7 +122,7 @@ def _pose(poses: Poses, listed: str, path: Path) -> NDArray[np.float64] | None:
         matrix[:3, 1:3] *= -1  # OpenCV axes to OpenGL axes
         return poses.read(listed, matrix)
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise type(error)(f"{path}: {error}") from None
 
 
 def _box(path: Path) -> NDArray[np.float64]:
@@ -131,4 +131,4 @@ def _box(path: Path) -> NDArray[np.float64]:
     try:
         return check_box(numbers[:6], "the box")
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise type(error)(f"{path}: {error}") from None

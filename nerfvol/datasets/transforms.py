@@ -236,7 +236,7 @@ def _entry(
         calibration = calibration or read_calibration(everything)
         c2w = poses.read(listed, read_matrix(entry["transform_matrix"]))
     except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+        raise type(error)(f"{where}: {error}") from None
     light = everything.get("light")
     light = light if isinstance(light, str) and light else None
     return None if c2w is None else _Entry(listed, c2w, calibration, mask or None, light)

@@ -40,6 +40,16 @@ def test_one_entry_that_cannot_be_used_is_left_out(tmp_path, change, why):
     said(dataset, "1 of 12 frames cannot be used and are left out", why)
 
 
+def test_one_sheared_pose_is_no_odd_one(tmp_path):
+    """Axes that are not at right angles are a convention misread, or an edited file: nothing is trained on the rest."""
+
+    def change(document):
+        document["frames"][3]["transform_matrix"][0][0] += 9
+
+    with pytest.raises(InputError, match=r"frame 3 .*must be rigid .*orthonormal only to"):
+        load_dataset(scene(tmp_path, change=change))
+
+
 def test_entries_that_cannot_be_used_and_are_not_few_are_refused(tmp_path):
     def change(document):
         for frame in document["frames"][3:6]:
