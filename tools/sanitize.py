@@ -24,12 +24,17 @@ TESTS = (
 
 
 def runtime(compiler: str) -> str:
-    """The sanitizer's shared library, which must be loaded before Python; empty where there is none."""
-    for name in ("libasan.so", "libclang_rt.asan-x86_64.so", "libclang_rt.asan-aarch64.so"):
-        found = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
-        if Path(found.stdout.strip()).is_absolute():
-            return found.stdout.strip()
-    return ""
+    """The libraries that must be loaded before Python: the sanitizer's, and C++'s, in which it looks for the function that
+    throws while it starts; empty where there is no sanitizer."""
+    names = ("libasan.so", "libclang_rt.asan-x86_64.so", "libclang_rt.asan-aarch64.so")
+    found = next((path for name in names if (path := _library(compiler, name))), "")
+    return f"{found} {_library(compiler, 'libstdc++.so.6')}".strip() if found else ""
+
+
+def _library(compiler: str, name: str) -> str:
+    """The path of a library of the compiler's, or ""."""
+    found = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+    return found.stdout.strip() if Path(found.stdout.strip()).is_absolute() else ""
 
 
 def main() -> int:
