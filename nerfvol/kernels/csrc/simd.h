@@ -224,11 +224,11 @@ inline f4 quad_least(const f16& v) {
     return pairs(pairs(quarter<0>(v), quarter<1>(v)), pairs(quarter<2>(v), quarter<3>(v)));
 }
 
-template <class V> struct Integers;
-template <> struct Integers<f4> { typedef i4v type; };
-template <> struct Integers<f8> { typedef i8v type; };
+template <class V> struct Integers;         // bits: sums that may run over
+template <> struct Integers<f4> { typedef i4v type; typedef uint32_t bits __attribute__((vector_size(16))); };
+template <> struct Integers<f8> { typedef i8v type; typedef uint32_t bits __attribute__((vector_size(32))); };
 #if defined(__AVX512F__)
-template <> struct Integers<f16> { typedef i16v type; };
+template <> struct Integers<f16> { typedef i16v type; typedef uint32_t bits __attribute__((vector_size(64))); };
 #endif
 
 // e^x, about 1 ulp (Cephes' polynomial); x below -87.3 gives a number below 1.3e-38 rather than exactly zero.

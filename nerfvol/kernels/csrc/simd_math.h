@@ -27,7 +27,7 @@ template <class H> inline Pair<H> vsqrt(const Pair<H>& v) { return {vsqrt(v.lo),
 
 // 2^x for -126 <= x < 128, relative error 2e-7; anything for other x.
 template <class V> inline V vexp2_normal(const V& x) {
-    typedef typename Integers<V>::type I;
+    typedef typename Integers<V>::bits U;
     const V magic = splat<V>(12582912.0f);  // 1.5 * 2^23
     const V shifted = x + magic;
     const V r = x - (shifted - magic);
@@ -37,7 +37,7 @@ template <class V> inline V vexp2_normal(const V& x) {
     p = p * r + 2.402211963e-01f;
     p = p * r + 6.931469670e-01f;
     p = p * r + 1.000000072e+00f;
-    return (V)((I)p + ((I)shifted << 23));   // to the exponent; what is above the integer falls off
+    return (V)((U)p + ((U)shifted << 23));   // to the exponent; what is above the integer falls off
 }
 #if defined(__AVX512DQ__)
 inline f16 vexp2_normal(const f16& x) {  // x = floor(x) + r in one instruction each way
