@@ -9,7 +9,7 @@ import sys
 
 import data_synth as ds
 import nerfvol
-from nerfvol.config.training import DistillConfig, FieldConfig
+from nerfvol.config.field import DistillConfig, FieldConfig
 from nerfvol.octree.io import save_octree
 from nerfvol.starts.field import distill
 from nerfvol.training.field_trainer import FieldTrainer

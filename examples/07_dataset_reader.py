@@ -11,7 +11,7 @@ from PIL import Image
 
 import data_synth as ds
 import nerfvol
-from nerfvol.config.training import OctreeConfig
+from nerfvol.config.octree import OctreeConfig
 from nerfvol.region import SceneBounds
 from nerfvol.training.octree_trainer import OctreeTrainer
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from nerfvol import __version__
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.assemble import assemble, to_plain
-from nerfvol.config.training import FieldShape
+from nerfvol.config.field import FieldShape
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD, WHITE
 from nerfvol.errors import InputError, shown
 from nerfvol.field.layout import Domain, GridLevels, layers_of

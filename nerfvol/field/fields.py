@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from nerfvol import sh as spherical
-from nerfvol.config.training import FieldShape
+from nerfvol.config.field import FieldShape
 from nerfvol.field.encodings import FrequencyEncoding, HashGrid
 from nerfvol.field.layout import Domain
 

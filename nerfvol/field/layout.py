@@ -16,7 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from nerfvol.config.training import FieldShape
+    from nerfvol.config.field import FieldShape
 
 BRICK = (2, 2, 4)
 """Vertices of a brick along x, y, z: what a finer level hashes, and stores in a row."""

@@ -24,7 +24,7 @@ from nerfvol.kernels.field_state import (
 from nerfvol.native import native
 
 if TYPE_CHECKING:
-    from nerfvol.config.training import FieldShape
+    from nerfvol.config.field import FieldShape
 
 __all__ = [
     "FieldBatch", "FieldLoss", "FieldRates", "FieldState", "FieldStepReport", "March", "Occupancy", "evaluate",

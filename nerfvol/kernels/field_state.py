@@ -20,7 +20,7 @@ from nerfvol.field.layout import GROUP, Domain, GridLevels, layers_of, step_edge
 from nerfvol.native import aligned, aligned_empty, native
 
 if TYPE_CHECKING:
-    from nerfvol.config.training import FieldShape
+    from nerfvol.config.field import FieldShape
 
 Float = NDArray[np.float32]
 COARSE = 4

@@ -153,7 +153,7 @@ def measure_reference(octree: Octree, cameras: Sequence[Camera], record: dict[st
     need_torch("the comparison with plain torch (--no-reference leaves it out)")
     import torch
 
-    from nerfvol.config.training import FieldShape
+    from nerfvol.config.field import FieldShape
     from nerfvol.field.fields import make_field
     from nerfvol.field.layout import Domain
     from nerfvol.kernels import on_torch, reference

@@ -12,7 +12,7 @@ from typing import cast
 
 import numpy as np
 
-from nerfvol.config.training import DistillConfig
+from nerfvol.config.field import DistillConfig
 from nerfvol.errors import InputError
 from nerfvol.field.layout import Domain, PointField
 from nerfvol.native import native

@@ -20,7 +20,7 @@ from typing import cast
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import DistillConfig
+from nerfvol.config.field import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.field.layout import Domain, PointField

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerfvol.config.training import FieldConfig
+from nerfvol.config.field import FieldConfig
 from nerfvol.errors import InputError
 from nerfvol.field.layout import Domain
 from nerfvol.kernels import field_ops

@@ -17,7 +17,9 @@ from typing import cast
 import numpy as np
 
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
-from nerfvol.config.training import Config, DistillConfig, OctreeConfig
+from nerfvol.config.field import DistillConfig
+from nerfvol.config.octree import OctreeConfig
+from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.photographs import Photographs

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from nerfvol.config.training import FieldConfig
+from nerfvol.config.field import FieldConfig
 from nerfvol.errors import InputError
 from nerfvol.native import need_torch
 from nerfvol.training.compiled_field import CompiledFieldTrainer, compiled_refusal

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfvol.config.training import FieldConfig
+from nerfvol.config.field import FieldConfig
 from nerfvol.errors import InputError
 from nerfvol.field.fields import AtPoints, RadianceField, make_field
 from nerfvol.field.occupancy import OccupancyGrid, OccupiedField, Samples, StepSchedule

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfvol.config.field import FieldConfig
 from nerfvol.config.medium import MediumConfig
 from nerfvol.config.splats import SplatConfig
-from nerfvol.config.training import Config, FieldConfig
+from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs, estimate_bytes
 from nerfvol.datasets.tiles import foreground_share

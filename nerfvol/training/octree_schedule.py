@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from nerfvol.config.training import OctreeConfig
+from nerfvol.config.octree import OctreeConfig
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 

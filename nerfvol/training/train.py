@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfvol import __version__
-from nerfvol.config.training import FINEST_LEVEL, Config
+from nerfvol.config.octree import FINEST_LEVEL
+from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError

@@ -11,8 +11,10 @@ from typing import Annotated, ClassVar, Literal
 import pytest
 
 from nerfvol.config.assemble import assemble, parse_assignment, read_yaml, to_plain, write_yaml
+from nerfvol.config.field import DistillConfig, FieldConfig, FieldShape
+from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig
 from nerfvol.config.splats import SplatConfig
-from nerfvol.config.training import FINEST_LEVEL, Config, DistillConfig, FieldConfig, FieldShape, OctreeConfig
+from nerfvol.config.training import Config
 from nerfvol.config.values import (
     Checked,
     Colour,

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nerfvol import sh as spherical
-from nerfvol.config.training import FieldShape
+from nerfvol.config.field import FieldShape
 from nerfvol.errors import InputError
 from nerfvol.field.fields import (
     ROWS,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerfvol.config.training import FieldShape
+from nerfvol.config.field import FieldShape
 from nerfvol.field.layout import Domain
 from nerfvol.kernels.field_ops import FieldBatch, FieldLoss, FieldState, March, Occupancy
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.config.training import DistillConfig
+from nerfvol.config.field import DistillConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.field.layout import Domain

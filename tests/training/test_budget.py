@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerfvol.cli.command import set_threads
-from nerfvol.config.training import FieldConfig
+from nerfvol.config.field import FieldConfig
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree

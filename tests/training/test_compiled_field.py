@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerfvol.config.training import DistillConfig, FieldConfig, FieldShape
+from nerfvol.config.field import DistillConfig, FieldConfig, FieldShape
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint

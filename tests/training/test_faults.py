@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerfvol.config.training import FINEST_LEVEL, Config, OctreeConfig, finest_level
+from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig, finest_level
+from nerfvol.config.training import Config
 from nerfvol.datasets.fingerprint import changes, fingerprint
 from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.load import load_dataset

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.config.training import FieldConfig, FieldShape
+from nerfvol.config.field import FieldConfig, FieldShape
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.field.sampling import intersect_aabb, step_generator

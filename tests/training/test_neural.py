@@ -8,7 +8,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import FieldConfig, FieldShape
+from nerfvol.config.field import FieldConfig, FieldShape
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.kernels.field_model import EARLY_STOP

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from nerfvol.config.training import OctreeConfig
+from nerfvol.config.octree import OctreeConfig
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.training import session

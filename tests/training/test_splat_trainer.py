@@ -17,7 +17,8 @@ import nerfvol
 from nerfvol.cameras.camera import Intrinsics
 from nerfvol.cli.command import set_threads
 from nerfvol.config.assemble import assemble
-from nerfvol.config.training import Config, OctreeConfig
+from nerfvol.config.octree import OctreeConfig
+from nerfvol.config.training import Config
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
