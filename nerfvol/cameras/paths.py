@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.calibration import Calibration, finite_number, lens_keys, read_calibration, read_matrix
-from nerfvol.cameras.camera import Camera, Intrinsics, orbit, orbit_axes
+from nerfvol.cameras.camera import Camera, Intrinsics, orbit
 from nerfvol.cameras.focus import focus_point
 from nerfvol.cameras.path_files import as_own_document
+from nerfvol.cameras.pose import orbit_axes
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_json
 

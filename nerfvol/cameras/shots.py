@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras.camera import Camera, Intrinsics, look_at, orbit_axes
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.cameras.paths import DEFAULT_ANGLE_X, DEFAULT_SIZE, orbit_cameras
+from nerfvol.cameras.pose import orbit_axes
 from nerfvol.errors import InputError
 
 Float = NDArray[np.float64]

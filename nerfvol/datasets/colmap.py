@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from nerfvol.cameras.camera import FARTHEST, rigid_pose
 from nerfvol.cameras.lens import BrownConrady
+from nerfvol.cameras.pose import FARTHEST, rigid_pose
 from nerfvol.datasets.colmap_files import (
     PointRecord,
     count_images,

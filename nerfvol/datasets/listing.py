@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.calibration import Calibration
-from nerfvol.cameras.camera import ShearedPose, unscaled_pose
+from nerfvol.cameras.pose import ShearedPose, unscaled_pose
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.images import SUFFIXES
 from nerfvol.datasets.points import ModelPoints

@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerfvol.cameras.calibration import CAMERA_MODELS, lens_keys, read_calibration
-from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, rigid_pose, tile_pixels
+from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, tile_pixels
 from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import PINHOLE as NO_DISTORTION
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
+from nerfvol.cameras.pose import rigid_pose
 from nerfvol.errors import InputError
 
 EPS32, EPS64 = 2.0**-23, 2.0**-52
