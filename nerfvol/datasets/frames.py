@@ -208,6 +208,24 @@ def _may_lie(view: View, header: ImageHeader) -> bool:
     return header.orientation <= 4 or width == height or not (stated or calibration.cx is not None)
 
 
+def _on_files(views: Sequence[View], headers: dict[int, ImageHeader]) -> list[str]:
+    """Sentences on pictures that are not what a file of this name usually is: in other colours, or several in one."""
+    said, by_name = [], {}
+    for view in views:
+        colours = headers[id(view.frame)].colours
+        if colours is not None:
+            by_name.setdefault(colours, []).append(view.frame.listed)
+    for colours, names in by_name.items():
+        done = "they are converted to it" if colours.is_known else "they are taken as if they were sRGB's"
+        said.append(f"{len(names)} of {len(views)} images state other colours than sRGB ({colours.name}): {done}")
+    if several := [view.frame.listed for view in views if headers[id(view.frame)].pictures > 1]:
+        said.append(
+            f"{len(several)} of {len(views)} images are files of several pictures, animations or pages: the first of each is "
+            f"used: {named(several)}"
+        )
+    return said
+
+
 def _tell(
     frames: Sequence[Frame], headers: dict[int, ImageHeader], made: dict[int, View], wrong: dict[int, InputError],
     by_pose: set[int], messages: list[str],
@@ -216,6 +234,7 @@ def _tell(
     views = list(made.values())
     if wrong:
         messages.append(f"{len(wrong)} images do not fit the others and are left out: {next(iter(wrong.values()))}")
+    messages += _on_files(views, headers)
     far = [view.frame.listed for view in views if id(view) in by_pose]
     if far:
         messages.append(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from nerfvol.cameras.warp import reduce
+from nerfvol.datasets.colours import Colours, colours_of, eight_bits
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
 from nerfvol.files.unchanged import while_unchanged
@@ -36,6 +37,7 @@ FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 """Whose decoders a file may reach."""
 _OR = "PNG, JPEG, WEBP, BMP or TIFF"
 _EXIF_ORIENTATION = 0x0112
+_TIFF_BITS, _TIFF_PLANES = 258, 284
 
 
 def map_threads(function: Callable[[Item], Made], items: Iterable[Item], threads: int | None = None) -> list[Made]:
@@ -109,10 +111,13 @@ def _looks_like(path: Path) -> str:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """``size``: (width, height) in pixels as stored. ``orientation``: EXIF's, 1 to 8; 1: as stored."""
+    """``size``: (width, height) in pixels as stored. ``orientation``: EXIF's, 1 to 8; 1: as stored. ``colours``: those that
+    it states instead of sRGB's. ``pictures``: how many the file holds, of which the first counts."""
 
     size: tuple[int, int]
     orientation: int
+    colours: Colours | None = None
+    pictures: int = 1
 
     @property
     def upright(self) -> tuple[int, int]:
@@ -127,7 +132,9 @@ def image_header(path: Path) -> ImageHeader:
     with _opened(path) as image:
         orientation = _exif(image, path).get(_EXIF_ORIENTATION, 1)
         known = type(orientation) is int and 1 <= orientation <= 8
-        return ImageHeader(image.size, orientation if known else 1)
+        several = image.format != "MPO"  # what phones write behind a photograph is a map of its brightness
+        pictures = getattr(image, "n_frames", 1) if several else 1
+        return ImageHeader(image.size, orientation if known else 1, colours_of(image), pictures)
 
 
 def _exif(image: Image.Image, path: Path) -> Image.Exif:
@@ -167,8 +174,8 @@ def turned(image: UInt8, orientation: int) -> UInt8:
 def read_image(path: Path, orientation: int = 1) -> UInt8:
     """The image as uint8: (h, w, 4) where the file has transparency, else (h, w, 3); grey and palettes are expanded.
 
-    16-bit channels are reduced to 8. ``orientation``: how to turn it, as EXIF numbers it; by default pixels stay as stored,
-    which is what most poses refer to.
+    16-bit channels are reduced to 8, other colours than sRGB's become those (datasets.colours). ``orientation``: how to turn
+    it, as EXIF numbers it; by default pixels stay as stored, which is what most poses refer to.
 
     Raises:
         InputError: there is no such image, it is damaged, has 32 bits a channel or more than MAX_PIXELS.
@@ -222,12 +229,22 @@ def read_mask(path: Path, size: tuple[int, int], orientation: int = 1) -> UInt8:
     return np.ascontiguousarray(mask[rows.astype(int)[:, None], columns.astype(int)])
 
 
+def _is_misread(image: Image.Image) -> bool:
+    """Whether Pillow takes 16-bit planes for 8-bit ones: half of the picture would be of high bytes, half of low ones."""
+    tags = getattr(image, "tag_v2", {})
+    return tags.get(_TIFF_PLANES) == 2 and max(tags.get(_TIFF_BITS, (8,))) > 8
+
+
 def _pixels(image: Image.Image, path: Path) -> UInt8:
-    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):  # as older Pillows call it
-        grey = (np.asarray(image).astype(np.uint32) + 128) // 257
-        return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
-    if image.mode in ("I", "F"):
+    if image.mode == "F" or (image.mode == "I" and image.format != "PNG"):
         raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32-bit pixels (mode {image.mode})")
+    if image.format == "TIFF" and _is_misread(image):
+        raise InputError(f"{path}: a TIFF of 16 bits with a plane for each colour is not read: save it as PNG")
+    colours = colours_of(image)
+    if colours is not None and colours.is_known:
+        return np.asarray(colours.to_srgb(image))
+    if image.mode.startswith("I"):
+        return np.repeat(eight_bits(image)[..., None], 3, axis=2)
     has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
     wanted = "RGBA" if has_alpha else "RGB"
     return np.asarray(image if image.mode == wanted else image.convert(wanted))

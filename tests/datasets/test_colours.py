@@ -1,0 +1,173 @@
+"""Pictures in other colours than sRGB become sRGB, and a sentence says so; files of several pictures are told."""
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image, ImageCms, PngImagePlugin
+
+from nerfvol.datasets.colours import colours_of
+from nerfvol.datasets.images import read_image, read_mask
+from nerfvol.datasets.load import load_dataset
+from nerfvol.errors import InputError
+from tests.datasets.test_whatever_people_bring import said, scene
+from tests.fixtures import scenes
+
+# Columns of D50 XYZ of each space's primaries, as its ICC profile has them.
+SRGB = np.array([[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]])
+P3 = np.array([[0.51512, 0.29198, 0.15710], [0.24120, 0.69225, 0.06657], [-0.00105, 0.04189, 0.78407]])
+ADOBE = np.array([[0.60974, 0.20528, 0.14919], [0.31111, 0.62567, 0.06322], [0.01947, 0.06087, 0.74457]])
+COLOURS = np.array(
+    [[[200, 100, 50], [90, 140, 60], [128, 128, 128], [10, 20, 30], [250, 240, 230], [60, 60, 160]]], np.uint8
+)
+
+
+def profile(primaries, gamma, name) -> bytes:
+    """An ICC version 2 profile of primaries (3, 3), D50, and a power, written out by hand (ICC.1:2001-04)."""
+
+    def numbers(values):
+        return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(v * 65536) for v in values))
+
+    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256))
+    tags = {b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(name) + 1) + name.encode() + bytes(79),
+            b"wtpt": numbers((0.9642, 1, 0.8249)), b"cprt": b"text\0\0\0\0\0"}  # fmt: skip
+    for letter, column in zip("rgb", primaries.T, strict=True):
+        tags |= {f"{letter}XYZ".encode(): numbers(column), f"{letter}TRC".encode(): curve}
+    table, body, first = struct.pack(">I", len(tags)), b"", 128 + 4 + 12 * len(tags)
+    for tag, data in tags.items():
+        table += tag + struct.pack(">II", first + len(body), len(data))
+        body += data + bytes(-len(data) % 4)
+    head = struct.pack(">I4sI4s4s4s", first + len(body), b"lcms", 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    head += bytes(12) + b"acsp" + bytes(28) + struct.pack(">3i", 63190, 65536, 54061) + bytes(48)
+    return head + table + body
+
+
+def srgb_of(values, primaries, gamma):
+    """What ``values`` (..., 3) mean in sRGB, 0 to 255, by the definitions."""
+    light = np.clip((values / 255.0) ** gamma @ (np.linalg.inv(SRGB) @ primaries).T, 0, 1)
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def save(path, **more):
+    Image.fromarray(COLOURS).save(path, **more)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
+@pytest.mark.parametrize(("primaries", "gamma"), [(P3, 2.2), (ADOBE, 2.19921875), (SRGB, 1.8)])
+def test_a_profile_is_applied(tmp_path, suffix, primaries, gamma):
+    path = save(tmp_path / f"a{suffix}", icc_profile=profile(primaries, gamma, "own"), lossless=True)
+    # A level for rounding, and one for the profile's own numbers, of 8 bits behind the point of the power.
+    assert np.abs(read_image(path) - srgb_of(COLOURS, primaries, gamma)).max() <= 2
+    assert np.abs(srgb_of(COLOURS, primaries, gamma) - COLOURS).max() > 8
+
+
+def test_profiles_that_are_srgb_change_no_bit(tmp_path):
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    path = save(tmp_path / "a.png", icc_profile=own)
+    assert (read_image(path) == COLOURS).all()
+    with Image.open(path) as image:
+        assert colours_of(image) is None
+
+
+def test_transparency_and_palettes_keep_theirs(tmp_path):
+    p3 = profile(P3, 2.2, "P3")
+    alpha = np.arange(6, dtype=np.uint8)[None, :, None] * 40
+    Image.fromarray(np.concatenate([COLOURS, alpha], axis=2)).save(tmp_path / "a.png", icc_profile=p3)
+    image = read_image(tmp_path / "a.png")
+    assert (image[..., 3:] == alpha).all() and np.abs(image[..., :3] - srgb_of(COLOURS, P3, 2.2)).max() <= 2
+    palette = Image.fromarray(COLOURS).quantize(6)
+    palette.save(tmp_path / "p.png", icc_profile=p3)
+    plain = np.asarray(palette.convert("RGB"))
+    assert np.abs(read_image(tmp_path / "p.png") - srgb_of(plain, P3, 2.2)).max() <= 2
+
+
+def test_a_png_says_its_gamma(tmp_path):
+    """gAMA is the power that made values of light; sRGB's own chunk, or its own power, changes nothing."""
+    for gamma, more, expected in (
+        (1.0, (), srgb_of(COLOURS, SRGB, 1.0)),
+        (0.45455, (), COLOURS),
+        (1.0, (b"sRGB",), COLOURS),
+    ):
+        info = PngImagePlugin.PngInfo()
+        info.add(b"gAMA", round(gamma * 100000).to_bytes(4, "big"))
+        for chunk in more:
+            info.add(chunk, b"\0")
+        assert np.abs(read_image(save(tmp_path / "a.png", pnginfo=info)) - expected).max() <= 0.51
+
+
+def test_sixteen_bits_of_linear_light(tmp_path):
+    values = np.linspace(0, 65535, 24).astype(np.uint16).reshape(2, 12, 1)
+    data = scenes.png_bytes(values)
+    chunk = b"gAMA" + (100000).to_bytes(4, "big")
+    (tmp_path / "a.png").write_bytes(
+        data[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    )
+    expected = srgb_of(np.repeat(np.rint(values / 257), 3, axis=2), SRGB, 1.0)
+    assert np.abs(read_image(tmp_path / "a.png") - expected).max() <= 0.51
+
+
+def test_cameras_mark_adobe_rgb_in_exif(tmp_path):
+    """Uncalibrated, and the interoperability R03, as the camera file system's rules have it."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA001] = 0xFFFF
+    exif.get_ifd(0x8769)[0xA005] = {1: "R03"}
+    big = Image.fromarray(np.repeat(np.repeat(COLOURS, 16, axis=0), 16, axis=1))
+    big.save(tmp_path / "a.jpg", exif=exif, quality=100, subsampling=0)
+    plain = np.asarray(Image.open(tmp_path / "a.jpg").convert("RGB"))
+    assert np.abs(read_image(tmp_path / "a.jpg") - srgb_of(plain, ADOBE, 2.19921875)).max() <= 2
+    exif.get_ifd(0x8769)[0xA001] = 1
+    big.save(tmp_path / "b.jpg", exif=exif, quality=100, subsampling=0)
+    assert (read_image(tmp_path / "b.jpg") == plain).all()
+
+
+def test_masks_stay_black_and_white(tmp_path):
+    mask = np.repeat(np.where(np.arange(6) % 2, 255, 0).astype(np.uint8)[None, :, None], 3, axis=2)
+    Image.fromarray(mask).save(tmp_path / "m.png", icc_profile=profile(P3, 2.2, "P3"))
+    assert (read_mask(tmp_path / "m.png", (6, 1)) == mask[..., 0]).all()
+
+
+# ------------------------------------------------------------------ what a set says of it
+def again(folder, **more):
+    """Writes the pictures of a set again."""
+    for path in sorted((folder / "images").iterdir()):
+        with Image.open(path) as image:
+            image.load()
+        image.save(path, **more)
+    return folder
+
+
+@pytest.mark.parametrize(("more", "words"), [
+    ({"icc_profile": profile(P3, 2.2, "Display P3")}, ("10 of 10 images", "(Display P3)", "converted to it")),
+    ({"icc_profile": b"x" * 300}, ("10 of 10 images", "cannot be used", "as if they were sRGB's")),
+    ({"icc_profile": profile(P3, 2.2, "P3")[:150]}, ("cannot be used", "as if they were sRGB's")),
+    ({"save_all": True, "append_images": [Image.new("RGB", (24, 16))]}, ("files of several pictures", "the first of each")),
+])  # fmt: skip
+def test_a_set_in_other_colours_says_so(tmp_path, more, words):
+    said(load_dataset(again(scene(tmp_path), **more)), *words)
+
+
+def test_inks_without_a_profile_are_told(tmp_path):
+    scene(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        buffer = io.BytesIO()
+        Image.open(path).convert("CMYK").save(buffer, "JPEG")
+        path.write_bytes(buffer.getvalue())
+    said(load_dataset(tmp_path), "inks (CMYK)", "as if they were sRGB's")
+
+
+def test_planes_of_sixteen_bits_are_refused(tmp_path):
+    """Pillow takes the planes of such a TIFF for 8-bit ones, and shows high and low bytes side by side."""
+    path, size = tmp_path / "a.tif", 6 * 4
+    entries = [(256, 3, 1, 6), (257, 3, 1, 4), (258, 3, 3, 150), (259, 3, 1, 1), (262, 3, 1, 2), (273, 4, 3, 160),
+               (277, 3, 1, 3), (278, 3, 1, 4), (279, 4, 3, 180), (284, 3, 1, 2)]  # fmt: skip
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries))
+    head += b"".join(struct.pack("<HHII", *entry) for entry in entries) + bytes(4)
+    head = head.ljust(150, b"\0") + struct.pack("<3H", 16, 16, 16)
+    head = head.ljust(160, b"\0") + struct.pack("<3I", *(200 + 2 * size * i for i in range(3)))
+    head = head.ljust(180, b"\0") + struct.pack("<3I", *(2 * size,) * 3)
+    path.write_bytes(head.ljust(200, b"\0") + bytes(6 * size))
+    with pytest.raises(InputError, match="16 bits with a plane for each colour"):
+        read_image(path)
