@@ -120,13 +120,18 @@ def _focal(angle: float | None, size: int) -> float | None:
     if angle is None:
         return None
     if not 0 < angle < math.pi:
-        raise InputError(f"the field of view must be between 0 and pi radians, got {angle:g}")
+        hint = ": is it in degrees, which x_fov states?" if math.pi <= angle < 180 else ""
+        raise InputError(f"the field of view must be between 0 and pi radians, got {angle:g}{hint}")
     return 0.5 * size / math.tan(0.5 * angle)
 
 
+_MATRICES = ("K", "intrinsics", "intrinsic_matrix", "camera_intrinsics", "camera_matrix")
+"""What scripts call a calibration matrix; it counts where no other key states a focal length."""
+_ALIASES = {"fl_x": "fx", "fl_y": "fy", "w": "width", "h": "height"}
 CALIBRATION_KEYS = {
     "camera_model", "is_fisheye", "ftheta_p0", "latlong", "equirectangular", "w", "h", "fl_x", "fl_y", "cx", "cy", "x_fov",
-    "y_fov", "camera_angle_x", "camera_angle_y", *Rational.names(), *Fisheye.names(), *FieldOfView.names(),
+    "y_fov", "camera_angle_x", "camera_angle_y", "fx", "fy", "width", "height", *_MATRICES, *Rational.names(),
+    *Fisheye.names(), *FieldOfView.names(),
 }  # fmt: skip
 """What :func:`read_calibration` looks at."""
 CAMERA_MODELS: dict[str, type[Lens]] = {
@@ -179,12 +184,45 @@ def finite_number(data: Mapping[str, Any], *keys: str) -> float | None:
     return None
 
 
+def _in_our_words(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The keys with what others call fl_x, fl_y, cx, cy, w and h under these names, where they are not there themselves."""
+    found = {key: data[other] for key, other in _ALIASES.items() if data.get(other) is not None}
+    for name in () if _has_focal({**data, **found}) else (name for name in _MATRICES if data.get(name) is not None):
+        try:
+            matrix = np.array(data[name], dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            matrix = np.zeros(())
+        if matrix.shape in ((9,), (16,)):
+            matrix = matrix.reshape(3 if len(matrix) == 9 else 4, -1)
+        if matrix.shape not in ((3, 3), (4, 4), (3, 4)) or not np.allclose(matrix[1, 0], 0) or matrix[2, 2] != 1:
+            raise InputError(f"{name} must be a calibration matrix of 3 rows of 3 numbers, got {shown(data[name]):.60}")
+        found |= {"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    return {**found, **{key: value for key, value in data.items() if value is not None}} if found else data
+
+
+def _has_focal(data: Mapping[str, Any]) -> bool:
+    return any(
+        data.get(key) is not None for key in ("fl_x", "fl_y", "x_fov", "y_fov", "camera_angle_x", "camera_angle_y")
+    )
+
+
+def _idle(data: Mapping[str, Any]) -> list[str]:
+    """Others' keys whose values do not count, for ours say something else."""
+    idle = [
+        other
+        for key, other in _ALIASES.items()
+        if data.get(other) is not None and data.get(key) not in (None, data[other])
+    ]
+    return idle + [name for name in _MATRICES if data.get(name) is not None and _has_focal(data)]
+
+
 def read_calibration(data: Mapping[str, Any]) -> Calibration:
     """The calibration that the keys of a transforms.json state (docs/data.md lists them).
 
     Raises:
         InputError: a value that is no number, an unknown or unsupported camera_model.
     """
+    data = _in_our_words(data)
     model = data.get("camera_model") or _DEFAULT_MODEL
     model = model.strip().upper() if isinstance(model, str) else model
     if not isinstance(model, str) or model not in CAMERA_MODELS:
@@ -240,6 +278,8 @@ def calibration_doubts(data: Mapping[str, Any]) -> list[str]:
     said = []
     if unused := [key for key in stated if key not in lens.names()]:
         said.append(f"{', '.join(unused)} (a {lens.KIND} lens has no such coefficient, and they are not used)")
+    if idle := _idle(data):
+        said.append(f"{', '.join(idle)} (other keys for the same come first)")
     beyond = [key for key in stated if key in lens.names() and key not in _COEFFICIENTS.get(model, lens.names())]
     if beyond and type(lens) is CAMERA_MODELS[model]:
         said.append(f"camera_model {model} and {', '.join(beyond)}, which it has not (they are used)")

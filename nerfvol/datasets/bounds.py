@@ -17,16 +17,19 @@ from nerfvol.region import SceneBounds, cube
 MARGIN = 1.03
 BACKGROUND_FACTOR = 16
 _FORWARD_FACING = 0.05  # optical axes within about 13 degrees of one another: the point they meet in is ill-defined
-_INSTANT_NGP_SCALE = 0.33  # instant-ngp maps scene x to 0.33 x + 1/2 and models a cube of side aabb_scale around 1/2
+INSTANT_NGP_SCALE = 0.33
+"""instant-ngp maps scene x to 0.33 x + 1/2, unless a file states another scale, and models a cube of side aabb_scale there."""
 
 
 @dataclass(frozen=True)
 class BoundsHint:
-    """What a file says of the scene: an explicit ``aabb``, instant-ngp's ``aabb_scale``, near and far (scene units)."""
+    """What a file says of the scene: an explicit ``aabb``, near and far (scene units), instant-ngp's ``aabb_scale`` and how
+    many of its units a scene unit is."""
 
     aabb: NDArray[np.float64] | None = None
     aabb_scale: float | None = None
     near_far: tuple[float, float] | None = None
+    unit: float = INSTANT_NGP_SCALE
 
 
 def _half_angle_tangent(camera: Camera) -> float:
@@ -84,7 +87,7 @@ def estimate_bounds(
     else:
         half = float(np.median(distances))
     if hint.aabb_scale is not None:
-        half = min(half, 0.5 * hint.aabb_scale / _INSTANT_NGP_SCALE)
+        half = min(half, 0.5 * hint.aabb_scale / hint.unit)
     how = "the point all cameras look at, as far as " + ("their images reach" if bounded else "the median camera")
     sentence = f"scene bounds: a cube of half side {half:.4g} around {how}"
     return bounds_of_box(cube(focus.point, half), has_alpha, bounded), sentence

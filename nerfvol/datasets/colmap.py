@@ -6,6 +6,7 @@ the centre of the upper left pixel is (1/2, 1/2). Sources: docs/data.md.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections import Counter
 from collections.abc import Sequence
@@ -20,6 +21,7 @@ from nerfvol.datasets.colmap_files import (
     PointRecord,
     count_images,
     images_file,
+    model_files,
     points_file,
     read_cameras,
     read_images,
@@ -31,6 +33,7 @@ from nerfvol.datasets.masks import MaskFinder
 from nerfvol.datasets.points import ModelPoints
 from nerfvol.datasets.split_lists import split_frames
 from nerfvol.errors import InputError
+from nerfvol.files.entry import entry
 
 _PLACES = ("sparse", "colmap/sparse", "distorted/sparse", ".")
 _MOST_POINTS = 20_000  # that are looked at: enough to tell whether poses fit
@@ -45,20 +48,14 @@ def find_models(folder: Path) -> list[Path]:
     """The folders with cameras.bin and images.bin (or .txt) where COLMAP and its users put them, in order of their names."""
     found = []
     for place in _PLACES:
-        inside = folder / place
+        inside = functools.reduce(entry, place.split("/"), folder)
         try:
-            below = sorted(entry for entry in inside.iterdir() if entry.is_dir()) if place != "." else []
+            below = sorted(model for model in inside.iterdir() if model.is_dir()) if place != "." else []
         except OSError:
             continue
-        below.sort(key=lambda entry: (not entry.name.isdigit(), int(entry.name) if entry.name.isdecimal() else 0))
-        found += [entry for entry in (*below, inside) if _is_model(entry)]
+        below.sort(key=lambda model: (not model.name.isdigit(), int(model.name) if model.name.isdecimal() else 0))
+        found += [model for model in (*below, inside) if model_files(model) is not None]
     return found
-
-
-def _is_model(folder: Path) -> bool:
-    return any(
-        all((folder / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")) for suffix in (".bin", ".txt")
-    )
 
 
 def recognises(path: Path) -> bool:
@@ -96,7 +93,7 @@ def read(folder: Path, split: str) -> Listing:
         raise InputError(f"{folder}: expected a COLMAP model in sparse/0, but found none")
     model, messages = _largest(folder, models)
     source, calibrations = images_file(model), read_cameras(model)
-    if source.suffix == ".bin" and (model / "images.txt").is_file():
+    if source.suffix.lower() == ".bin" and entry(model, "images.txt").is_file():
         messages.append(f"{model.relative_to(folder)} holds a model as text too, which is not read")
     photographs = _photographs(folder, source)
     finder, masks, poses = ImageFinder(photographs), MaskFinder(folder, photographs), Poses(source)

@@ -18,6 +18,7 @@ from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import read_bytes, read_text
+from nerfvol.files.entry import entry
 
 # COLMAP's model ids, the lens they are, their parameters in its order; f stands for both focal lengths. What the lens has no
 # coefficient for has a star and must be zero.
@@ -66,35 +67,50 @@ class PointRecord(NamedTuple):
     track: Sequence[int]
 
 
-def is_binary(model: Path) -> bool:
-    """Whether a model (a folder) is read from its binary files: where both are there, they come first."""
-    return all((model / f"{stem}.bin").is_file() for stem in ("cameras", "images"))
+def model_files(model: Path) -> tuple[Path, Path] | None:
+    """The files of a model's cameras and of its images, in any case: both binary where there are such, else both text, else
+    one of each; None where one is missing."""
+    found = {(stem, suffix): file for stem in ("cameras", "images") for suffix in (".bin", ".txt")
+             if (file := entry(model, f"{stem}{suffix}")).is_file()}  # fmt: skip
+    for kinds in ((".bin", ".bin"), (".txt", ".txt"), (".bin", ".txt"), (".txt", ".bin")):
+        if ("cameras", kinds[0]) in found and ("images", kinds[1]) in found:
+            return found["cameras", kinds[0]], found["images", kinds[1]]
+    return None
+
+
+def _files(model: Path) -> tuple[Path, Path]:
+    files = model_files(model)
+    if files is None:
+        raise InputError(f"{model}: expected a COLMAP model, cameras and images as .bin or .txt, but there is none")
+    return files
 
 
 def images_file(model: Path) -> Path:
     """The file of a model's images."""
-    return model / ("images.bin" if is_binary(model) else "images.txt")
+    return _files(model)[1]
 
 
 def points_file(model: Path) -> Path | None:
     """The file of a model's points; None where there is none."""
-    return next((path for path in (model / "points3D.bin", model / "points3D.txt") if path.is_file()), None)
+    files = (entry(model, f"points3D{suffix}") for suffix in (".bin", ".txt"))
+    return next((path for path in files if path.is_file()), None)
 
 
 def read_cameras(model: Path) -> dict[int, Calibration]:
     """The calibration of each camera of a model by its number; InputError where the file or a camera is unusable."""
-    return _cameras_binary(model / "cameras.bin") if is_binary(model) else _cameras_text(model / "cameras.txt")
+    path = _files(model)[0]
+    return _cameras_binary(path) if path.suffix.lower() == ".bin" else _cameras_text(path)
 
 
 def read_images(model: Path) -> Iterator[ImageRecord]:
     """The images of a model; InputError where the file is damaged."""
     path = images_file(model)
-    return _images_binary(path) if path.suffix == ".bin" else _images_text(path)
+    return _images_binary(path) if path.suffix.lower() == ".bin" else _images_text(path)
 
 
 def read_points(path: Path) -> Iterator[PointRecord]:
     """The points of a points3D.bin or points3D.txt; InputError where the file is damaged, when reading comes that far."""
-    return _points_binary(path) if path.suffix == ".bin" else _points_text(path)
+    return _points_binary(path) if path.suffix.lower() == ".bin" else _points_text(path)
 
 
 def _calibration(model: str, width: int, height: int, parameters: tuple[float, ...]) -> Calibration:
@@ -242,7 +258,7 @@ def _image_of(path: Path, line: str) -> ImageRecord:
 def count_images(model: Path) -> int:
     """How many images a model says it has; InputError where its file is damaged."""
     path = images_file(model)
-    return _Cursor(path).take("Q")[0] if path.suffix == ".bin" else sum(1 for _ in _images_text(path))
+    return _Cursor(path).take("Q")[0] if path.suffix.lower() == ".bin" else sum(1 for _ in _images_text(path))
 
 
 def _points_binary(path: Path) -> Iterator[PointRecord]:

@@ -70,6 +70,7 @@ def find_format(path: Path) -> Format:
     raise InputError(f"{path}: expected posed images, but found {', '.join(others)} and {last}{_what_there_is(path)}")
 
 
+_ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".gz", ".7z", ".rar", ".bz2", ".xz")
 _OTHER_PROGRAMS = {
     "keyframes": "Polycam's raw data, which `ns-process-data polycam` converts",
     "rgbd": "Record3D's, which `ns-process-data record3d` converts",
@@ -80,6 +81,7 @@ _OTHER_PROGRAMS = {
     "cameras.sfm": "Meshroom's, which is not read",
     "bundle.out": "Bundler's, which is not read",
     "groundtruth.txt": "TUM's tracks, which are not read",
+    "database.db": "COLMAP's of features and matches: poses are in the model that its mapper writes, which is missing",
     "pose": "ScanNet's, 7-Scenes' or NSVF's without intrinsics.txt, which is not read",
 }
 """By what a folder of other programs is known, whose it is, and what makes of it something that is read."""
@@ -87,6 +89,8 @@ _OTHER_PROGRAMS = {
 
 def _what_there_is(path: Path) -> str:
     """The end of a sentence on what no format recognises: where one lies near it, or whose it looks like."""
+    if path.name.lower().endswith(_ARCHIVES):
+        return "; it is an archive: unpack it first"
     if path.is_file():
         return "; poses of a video or of photographs are found by `nerfvol capture`"
     try:
@@ -101,6 +105,11 @@ def _what_there_is(path: Path) -> str:
     for name, whose in _OTHER_PROGRAMS.items():
         if (path / name).exists():
             return f"; {name} is {whose}"
+    names = sorted(entry.name for entry in path.iterdir() if not entry.name.startswith("."))
+    if packed := [name for name in names if name.lower().endswith(_ARCHIVES)]:
+        return f"; {packed[0]} is an archive: unpack it first"
+    if stated := [name for name in names if name.lower().endswith(".json") and "transforms" in name.lower()]:
+        return f"; is {stated[0]} meant? Name the file itself"
     suffixes = (".jpg", ".jpeg", ".png", ".heic")
     if any(entry.suffix.lower() in suffixes for folder in (path, path / "images") for entry in folder.glob("*")):
         return "; of photographs without poses, `nerfvol capture` or --poses auto finds them"

@@ -140,20 +140,25 @@ def _doubts(cameras: Sequence[Camera], focus: Focus) -> list[str]:
         return []
     poses = np.stack([camera.c2w for camera in cameras])
     apart = np.abs(poses - poses[0]).max(axis=0)
-    if (apart[:3, 3] <= 1e-9 * np.abs(poses[0, :3, 3])).all():
+    if apart[:3, 3].max() <= 1e-9 * np.abs(poses[0, :3, 3]).max():
         if (apart <= 1e-9).all():
             return [f"all {len(cameras)} poses are the same: were the cameras found at all?"]
-        return ["all cameras stand at one point, as in a panorama: nothing tells how far away things are"]
+        return [
+            "all cameras stand at one point, as in a panorama: nothing tells how far away things are; or are the poses "
+            "world-to-camera matrices, which are to be inverted?"
+        ]
     inverse = focus_of(np.linalg.inv(poses).astype(np.float64, copy=False))
     meets = focus.certainty >= WELL_FIXED and focus.spread < 0.2
-    if not (meets and focus.ahead >= LOOKS_IN) and (
-        inverse.certainty >= WELL_FIXED and inverse.ahead >= 0.9 and inverse.spread < 0.1
-    ):
-        return [
-            "the poses make sense as world-to-camera matrices: taken so, all cameras look at one point, and as the "
-            "camera-to-world matrices that are expected they do not; are they to be inverted?"
-        ]
-    if meets and focus.ahead <= LOOKS_AWAY:
+    looks_away = meets and focus.ahead <= LOOKS_AWAY
+    if inverse.certainty >= WELL_FIXED and inverse.spread < 0.1 and not (meets and focus.ahead >= LOOKS_IN):
+        opencv = inverse.ahead <= LOOKS_AWAY and not looks_away
+        if opencv or inverse.ahead >= 0.9:
+            axes = ", in OpenCV axes (y down, z forward)" if opencv else ""
+            return [
+                f"the poses make sense as world-to-camera matrices{axes}: taken so, all cameras look at one point, and as the "
+                "camera-to-world matrices that are expected they do not; are they to be inverted?"
+            ]
+    if looks_away:
         return [
             "all cameras look away from one point, as in a room seen from its middle: or are the poses in OpenCV axes (y down, "
             "z forward)? then negate the second and third column of each"

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from nerfvol.cameras.calibration import Calibration
 from nerfvol.datasets.bounds import BoundsHint
 from nerfvol.datasets.colmap_files import read_images
+from nerfvol.datasets.images import SUFFIXES
 from nerfvol.datasets.listing import PHOTOGRAPHS, Frame, Listing, Poses, is_photograph, named
 from nerfvol.datasets.masks import MaskFinder
 from nerfvol.datasets.split_lists import split_frames
 from nerfvol.errors import InputError
+from nerfvol.files.entry import entry
 from nerfvol.files.numpyfile import read_npy
 
 POSES = "poses_bounds.npy"
@@ -26,7 +28,7 @@ POSES = "poses_bounds.npy"
 
 def recognises(path: Path) -> bool:
     """Whether the folder holds LLFF poses."""
-    return (path / POSES).is_file()
+    return entry(path, POSES).is_file()
 
 
 def read(folder: Path, split: str) -> Listing:
@@ -36,7 +38,7 @@ def read(folder: Path, split: str) -> Listing:
         InputError: the file of poses is damaged, does not have as many as there are images, or holds a pose, lens or range
             of depths that cannot be used.
     """
-    path = folder / POSES
+    path = entry(folder, POSES)
     rows = _load_rows(path)
     images = image_folder(folder)
     names = sorted(entry.name for entry in images.iterdir() if is_photograph(entry))
@@ -74,6 +76,10 @@ def _registered(folder: Path, images: Path, names: list[str], count: int) -> tup
     Raises:
         InputError: there is no such model, or it does not have as many images as there are poses.
     """
+    one = _one_of_each(names, count)
+    if one is not None:
+        return one, [f"{images.name} holds each photograph as {named(sorted({Path(n).suffix for n in names}))}: "
+                     f"{Path(one[0]).suffix} is used"]  # fmt: skip
     wrong = f"{folder / POSES}: holds {count} poses, but {images.name} holds {len(names)} images"
     models = [folder / "sparse" / "0", folder / "sparse"]
     model = next((m for m in models if any((m / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
@@ -91,15 +97,26 @@ def _registered(folder: Path, images: Path, names: list[str], count: int) -> tup
     ]
 
 
+def _one_of_each(names: list[str], count: int) -> list[str] | None:
+    """The names of one suffix, the first of SUFFIXES, where all ``count`` photographs are there under each of several."""
+    by_suffix: dict[str, list[str]] = {}
+    for name in names:
+        by_suffix.setdefault(Path(name).suffix.lower(), []).append(name)
+    stems = {tuple(Path(name).stem for name in group) for group in by_suffix.values()}
+    if len(by_suffix) < 2 or len(stems) > 1 or len(names) != count * len(by_suffix):
+        return None
+    return by_suffix[min(by_suffix, key=SUFFIXES.index)]
+
+
 def image_folder(folder: Path) -> Path:
     """images, or the least reduced of images_2, images_4, ..., in any case; else input, as Gaussian splatting's scripts call
     it, image, rgb or color; a folder without them holds the photographs itself."""
     factors = {}
-    for entry in sorted(folder.iterdir()):
-        factor = PHOTOGRAPHS.fullmatch(entry.name.lower())
-        if factor is not None and entry.is_dir():
-            factors[entry] = np.inf if factor[2] else int(factor[1] or 1)
-    return min(factors, key=lambda entry: factors[entry]) if factors else folder
+    for inside in sorted(folder.iterdir()):
+        factor = PHOTOGRAPHS.fullmatch(inside.name.lower())
+        if factor is not None and inside.is_dir():
+            factors[inside] = np.inf if factor[2] else int(factor[1] or 1)
+    return min(factors, key=lambda inside: factors[inside]) if factors else folder
 
 
 def _load_rows(path: Path) -> NDArray[np.float64]:

@@ -36,7 +36,7 @@ from nerfvol.datasets.images import (
 )
 from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
 from nerfvol.datasets.listing import Frame, Listing, listed_names, named, require_few
-from nerfvol.datasets.odd_ones import blank
+from nerfvol.datasets.odd_ones import blank, dim
 from nerfvol.datasets.sampled import Sampled, sample, seen_small
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError, shown
@@ -99,7 +99,7 @@ def load_dataset(
     judged = [(replace(view, circle=circles.get(view.camera.intrinsics)), picture) for view, picture in judged]
     evidence = look(*seen_small(judged))
     bounds, decision, said = _scene_of(listing, training_views, box, evidence, scene)
-    messages += [*decision.doubts, decision.sentence, said]
+    messages += [*dim([picture for _, picture in judged]), *decision.doubts, decision.sentence, said]
     # In photographs of a place what is transparent was not seen, by whatever cut it out.
     cut_out = decision.kind != "object"
 

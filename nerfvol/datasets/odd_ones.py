@@ -14,6 +14,8 @@ from nerfvol.datasets.listing import MOST_LOST, are_few, named
 if TYPE_CHECKING:
     from nerfvol.datasets.frames import View
 
+DIM = 24
+"""Of 255 levels: no photograph is so dark throughout, and 12 bits in a file for 16 reach 15."""
 OTHER_LENS = 20
 """Times: focal lengths, in widths of the picture, that differ by more from the middle one are a mistake and no zoom."""
 
@@ -70,6 +72,17 @@ def blank(views: Sequence[View], images: Sequence[UInt8], messages: list[str]) -
         f"they are left out: {named([views[i].frame.listed for i in found])}"
     )
     return set(found)
+
+
+def dim(pictures: Sequence[UInt8]) -> list[str]:
+    """A sentence where all of the ``pictures`` (h, w, 3 or 4) are nearly black, as fewer bits in a file for more look."""
+    brightest = max((int(picture[..., :3].max()) for picture in pictures), default=255)
+    if brightest >= DIM:
+        return []
+    return [
+        f"the brightest of {len(pictures)} images has level {brightest} of 255: they are learnt as dark as they are; do their "
+        "numbers have fewer bits than their files, or are they linear?"
+    ]
 
 
 def _is_blank(image: UInt8) -> bool:

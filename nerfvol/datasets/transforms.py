@@ -22,13 +22,14 @@ from nerfvol.cameras.calibration import (
     read_calibration,
     read_matrix,
 )
-from nerfvol.datasets.bounds import BoundsHint
+from nerfvol.datasets.bounds import INSTANT_NGP_SCALE, BoundsHint
 from nerfvol.datasets.formats import SPLITS
 from nerfvol.datasets.listing import Frame, ImageFinder, Listing, Poses, named
 from nerfvol.datasets.masks import MaskFinder
 from nerfvol.datasets.split_lists import chosen_by_lists, resolved, split_frames
 from nerfvol.errors import InputError, shown
 from nerfvol.files.atomic import read_json
+from nerfvol.files.entry import entry as file_of
 from nerfvol.files.unchanged import while_unchanged
 from nerfvol.region import check_box
 
@@ -36,7 +37,7 @@ from nerfvol.region import check_box
 def recognises(path: Path) -> bool:
     """Whether the folder holds a transforms*.json this module reads, or is such a file itself."""
     names = ("transforms.json", *(f"transforms_{split}.json" for split in SPLITS))
-    return (path.is_file() and path.suffix.lower() == ".json") or any((path / name).is_file() for name in names)
+    return (path.is_file() and path.suffix.lower() == ".json") or any(file_of(path, name).is_file() for name in names)
 
 
 def read(path: Path, split: str) -> Listing:
@@ -50,9 +51,9 @@ def read(path: Path, split: str) -> Listing:
     """
     if path.is_file():
         return _single(_File(path), split)
-    files = {s: path / f"transforms_{s}.json" for s in SPLITS if (path / f"transforms_{s}.json").is_file()}
+    files = {s: file for s in SPLITS if (file := file_of(path, f"transforms_{s}.json")).is_file()}
     if not files:
-        return _single(_File(path / "transforms.json"), split)
+        return _single(_File(file_of(path, "transforms.json")), split)
     if "train" not in files and split == "train":
         raise InputError(f"{path}: expected transforms_train.json for the train views, but there is no such file")
     read_files = {name: _File(file) for name, file in files.items()}
@@ -85,8 +86,8 @@ def read(path: Path, split: str) -> Listing:
 
 def _unused(path: Path, files: Mapping[str, Path], split: str) -> list[str]:
     """Further transforms of the folder, which no split reads."""
-    others = sorted(entry.name for entry in path.glob("transforms*.json") if entry.name != "transforms.json"
-                    and entry not in files.values() and not entry.name.startswith("."))  # fmt: skip
+    others = sorted(other.name for other in path.glob("transforms*.json") if other.name != "transforms.json"
+                    and other not in files.values() and not other.name.startswith("."))  # fmt: skip
     return [f"not read: {named(others)}"] if others and split == "train" else []
 
 
@@ -245,7 +246,7 @@ def _entry(
 LONGEST_NAME = 200
 """Letters of a picture's name that sentences show whole."""
 _USED = {"frames", "file_path", "transform_matrix", "mask_path", "aabb", "aabb_scale", "ply_file_path",
-         "test_frames", *CALIBRATION_KEYS, *(f"{split}_filenames" for split in SPLITS)}  # fmt: skip
+         "test_frames", "scale", *CALIBRATION_KEYS, *(f"{split}_filenames" for split in SPLITS)}  # fmt: skip
 _EMPTY = (None, "", [], {}, 0, 0.0, False)
 
 
@@ -291,4 +292,5 @@ def _hint(data: Mapping[str, Any]) -> BoundsHint:
     scale = finite_number(data, "aabb_scale")
     if scale is not None and scale <= 0:
         raise InputError(f"aabb_scale must be positive, got {scale:g}")
-    return BoundsHint(aabb=box, aabb_scale=scale)
+    unit = finite_number(data, "scale") if scale is not None else None
+    return BoundsHint(aabb=box, aabb_scale=scale, unit=unit if unit is not None and unit > 0 else INSTANT_NGP_SCALE)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol import __version__
-from nerfvol.datasets.images import map_threads
+from nerfvol.datasets.images import FORMATS, map_threads
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import ensure_writable_folder, read_json, write_json
 from nerfvol.machine import describe_hardware
@@ -147,6 +147,10 @@ def gather(
         photographs, bad = sources.copy_photographs(paths, images, settings.size)
         sharp = float(np.median(judged.sharpness[chosen]))
         messages.append(f"{len(chosen)} of {n} frames are taken: the sharpest of each part in which something moves")
+        if video.is_high_range(path):
+            messages.append(
+                "the video has a high dynamic range (HLG or PQ): its frames are converted to an ordinary one (BT.709)"
+            )
         record: dict[str, Any] = {"frames": n, "chosen": chosen, "sharpness": sharp}
     else:
         paths = sources.find_photographs(path)
@@ -174,7 +178,7 @@ def picture_sharpness(path: Path) -> float:
     """Sharpness of a picture file as of a video's frames: of 320 pixels along its longer side."""
     from PIL import Image
 
-    with Image.open(path) as image:
+    with Image.open(path, formats=FORMATS) as image:
         image.draft("L", (2 * video.JUDGED_SIZE, 2 * video.JUDGED_SIZE))
         grey = image.convert("L")
         scale = min(1.0, video.JUDGED_SIZE / max(grey.size))

@@ -17,7 +17,7 @@ from nerfvol.datasets.listing import MaskFile
 from nerfvol.datasets.masks import MaskFinder
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write
-from nerfvol.poses.sources import HEIF_SUFFIXES, Photograph
+from nerfvol.poses.sources import HEIF_SUFFIXES, Photograph, formats_for
 
 
 def find_masks(folder: Path, paths: Sequence[Path]) -> dict[str, tuple[MaskFile, ...]]:
@@ -72,7 +72,7 @@ def copy_masks(
 def upright_size(path: Path) -> tuple[tuple[int, int], int]:
     """((width, height) once upright, EXIF's orientation) of a photograph, HEIC too."""
     if path.suffix.lower() in HEIF_SUFFIXES:
-        with Image.open(path) as image:  # Pillow's plug-in turns these itself
+        with Image.open(path, formats=formats_for(path)) as image:  # Pillow's plug-in turns these itself
             return image.size, 1
     header = image_header(path)
     return header.upright, header.orientation

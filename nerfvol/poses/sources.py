@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageOps
 
-from nerfvol.datasets.images import MAX_PIXELS, SUFFIXES, map_threads
+from nerfvol.datasets.colours import colours_of
+from nerfvol.datasets.images import FORMATS, MAX_PIXELS, SUFFIXES, map_threads
 from nerfvol.datasets.listing import is_left_aside
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write
@@ -138,8 +139,13 @@ def copy_photographs(paths: list[Path], folder: Path, size: int) -> tuple[list[P
     return [m for m in made if isinstance(m, Photograph)], [m for m in made if isinstance(m, str)]
 
 
+def formats_for(path: Path) -> tuple[str, ...]:
+    """The decoders that a photograph's file may reach: those of data sets, and HEIF's where its name says so."""
+    return (*FORMATS, "HEIF") if path.suffix.lower() in HEIF_SUFFIXES and reads_heif() else FORMATS
+
+
 def _copy(path: Path, folder: Path, name: str, size: int) -> Photograph:
-    with Image.open(path) as image:
+    with Image.open(path, formats=formats_for(path)) as image:
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}x{image.height} pixels are more than {MAX_PIXELS:,}")
         exif = image.getexif()
@@ -158,8 +164,10 @@ def _copy(path: Path, folder: Path, name: str, size: int) -> Photograph:
                 with atomic_write(target) as temporary:
                     shutil.copyfile(path, temporary)
         else:
-            image.draft("RGB", (2 * width, 2 * height))
-            upright = ImageOps.exif_transpose(image).convert("RGB")
+            colours = colours_of(image)  # the copy has no profile: in it are sRGB's
+            image.draft(None, (2 * width, 2 * height))
+            upright = ImageOps.exif_transpose(image)
+            upright = (upright if colours is None else colours.to_srgb(upright)).convert("RGB")
             with atomic_write(target) as temporary:
                 upright.resize((width, height), Image.Resampling.LANCZOS).save(temporary, format="JPEG", quality=96)
     focal = None if focal_35 is None else focal_35 * math.hypot(width, height) / FILM_DIAGONAL

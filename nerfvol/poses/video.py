@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -81,10 +82,13 @@ def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list
     names = [f"frame_{number:05d}.jpg" for number in chosen]
     with tempfile.TemporaryDirectory(dir=folder, prefix=".frames") as temporary:
         select = _any_of(chosen)
+        colours = _TO_ORDINARY_RANGE if is_high_range(path) else ":out_color_matrix=bt601"  # which is JPEG's matrix
         fit = f"scale='min({size},iw)':'min({size},ih)':force_original_aspect_ratio=decrease:flags=lanczos"
         out = ["-fps_mode", "passthrough", "-q:v", "2", "-f", "image2", str(Path(temporary) / "%05d.jpg")]
         result = subprocess.run(
-            [*_ffmpeg(path), "-vf", f"select='{select}',{fit}", *out], capture_output=True, stdin=subprocess.DEVNULL
+            [*_ffmpeg(path), "-vf", f"select='{select}',{fit}{colours}", *out],
+            capture_output=True,
+            stdin=subprocess.DEVNULL,
         )
         made = sorted(Path(temporary).glob("*.jpg"))
         if result.returncode or len(made) != len(chosen):
@@ -92,6 +96,21 @@ def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list
         for file, name in zip(made, names, strict=True):
             os.replace(file, folder / name)
     return names
+
+
+_TO_ORDINARY_RANGE = (
+    ",zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt709,tonemap=mobius:desat=0,zscale=t=bt709:m=smpte170m:r=full,"
+    "format=yuvj444p"
+)
+"""Filters from HLG or PQ in BT.2020 to BT.709 and JPEG's numbers: white at 203 candela per square metre as BT.2408 has it, what
+is brighter compressed."""
+
+
+def is_high_range(path: Path) -> bool:
+    """Whether a video has the high dynamic range that phones record (HLG, PQ), whose numbers taken as they are look pale."""
+    header = subprocess.run([*_ffmpeg(path)[:-4], "-loglevel", "info", *_ffmpeg(path)[-4:]], capture_output=True,
+                            stdin=subprocess.DEVNULL).stderr  # fmt: skip
+    return re.search(rb"Stream #0:\d+.*Video:.*(arib-std-b67|smpte2084)", header) is not None
 
 
 def _any_of(numbers: Sequence[int]) -> str:

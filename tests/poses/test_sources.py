@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from nerfvol.datasets.images import read_image
 from nerfvol.errors import InputError
 from nerfvol.poses import sources
 from nerfvol.poses.sources import camera_groups, copy_photographs, find_photographs
+from tests.datasets.test_colours import COLOURS, P3, profile, srgb_of
 
 EXIF, FOCAL, FOCAL_35, ORIENTATION, MODEL = 0x8769, 0x920A, 0xA405, 0x0112, 0x0110
 
@@ -52,6 +54,33 @@ def test_what_needs_no_change_is_copied_byte_by_byte(tmp_path):
     path = save(tmp_path / "in/a.jpg")
     copy_photographs([path], tmp_path / "out", 1000)
     assert (tmp_path / "out/a.jpg").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("turn", [1, 6])
+def test_copies_have_the_colours_that_the_photograph_states(tmp_path, turn):
+    """Phones photograph in Display P3; a copy that is turned or smaller has no profile, one byte by byte has its own."""
+    picture = np.repeat(np.repeat(COLOURS, 16, axis=0), 16, axis=1)
+    exif = Image.Exif()
+    exif[ORIENTATION] = turn
+    Image.fromarray(picture).save(tmp_path / "a.jpg", exif=exif, quality=98, icc_profile=profile(P3, 2.2, "Display P3"))
+    for size in (48, 1000):
+        (photograph,), _ = copy_photographs([tmp_path / "a.jpg"], tmp_path / f"out{size}", size)
+        copy = read_image(tmp_path / f"out{size}" / photograph.name)
+        # The middle of each patch, a sixth of the longer side of the picture; JPEG twice.
+        along = copy.swapaxes(0, 1) if copy.shape[0] > copy.shape[1] else copy
+        step = along.shape[1] / 6
+        found = along[along.shape[0] // 2, [int(step * (k + 0.5)) for k in range(6)]]
+        assert np.abs(found - srgb_of(COLOURS, P3, 2.2)[0]).max() <= 8
+
+
+def test_photographs_reach_no_other_decoders(tmp_path, monkeypatch):
+    """What is named .png and is PostScript would start another program."""
+    from PIL import EpsImagePlugin
+
+    monkeypatch.setattr(EpsImagePlugin, "EpsImageFile", lambda *a: pytest.fail("PostScript is decoded"))
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n")
+    copies, bad = copy_photographs([tmp_path / "a.png"], tmp_path / "out", 100)
+    assert not copies and "cannot identify image file" in bad[0]
 
 
 def test_groups_by_size_camera_and_focal_length(tmp_path):

@@ -1,5 +1,7 @@
 """Frames of a video: the sharpest of each part, none of parts that stand still, at the size that was asked for."""
 
+import subprocess
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -7,7 +9,7 @@ from PIL import Image
 from nerfvol.errors import InputError
 from nerfvol.files.pictures import open_video
 from nerfvol.measure.sharpness import sharpness
-from nerfvol.poses.video import Judged, choose_frames, judge_video, write_frames
+from nerfvol.poses.video import Judged, choose_frames, is_high_range, judge_video, write_frames
 
 
 def blurred(picture, times):
@@ -88,3 +90,59 @@ def test_a_video_in_the_middle_of_which_the_file_ends(video, tmp_path):
         assert 1 <= len(judge_video(path).sharpness) < 30
     except InputError as error:
         assert "cut.mp4" in str(error)
+
+
+COLOURS = np.array([[200, 100, 50], [60, 120, 200], [40, 160, 60], [120, 120, 120], [180, 60, 160]], np.uint8)
+HIGH = (
+    "scale=out_color_matrix=bt709:out_range=tv,format=yuv444p,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv,"
+    "zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt2020,zscale=t={0}:npl=203:m=bt2020nc:r=tv,format=yuv420p10le"
+)
+
+
+def coloured(folder, filters, *tags):
+    """A video of stripes of COLOURS, 32 pixels wide, with what the filters make of them and the colours that it states."""
+    import imageio_ffmpeg
+
+    Image.fromarray(COLOURS[None].repeat(64, 0).repeat(32, 1)).save(folder / "stripes.png")
+    stated = [part for tag in zip(("-color_primaries", "-color_trc", "-colorspace"), tags, strict=True) for part in tag]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-loglevel",
+        "error",
+        "-loop",
+        "1",
+        "-i",
+        str(folder / "stripes.png"),
+        "-t",
+        "0.2",
+    ]
+    video = folder / "v.mp4"
+    subprocess.run(
+        [*command, "-t", "0.2", "-vf", filters, "-c:v", "libx264", "-crf", "4", *stated, str(video)], check=True
+    )
+    return video
+
+
+def stripes(folder, video):
+    """The colours in the middle of the stripes of the video's second frame, as it is written."""
+    (name,) = write_frames(video, [1], folder / "images", 400)
+    with Image.open(folder / "images" / name) as image:
+        return np.asarray(image)[32, 16::32].astype(int)
+
+
+@pytest.mark.parametrize("matrix", ["bt709", "smpte170m"])
+def test_frames_have_the_videos_colours(tmp_path, matrix):
+    """JPEG's numbers are BT.601's whatever the video's: taken over as they are, those of BT.709 are 20 levels off. What is
+    left is 8 bits of two kinds of luma and chroma, and JPEG's own rounding."""
+    video = coloured(tmp_path, f"scale=out_color_matrix={matrix}:out_range=tv,format=yuv420p", *[matrix] * 3)
+    assert not is_high_range(video)
+    assert np.abs(stripes(tmp_path, video) - COLOURS).max() <= 6
+
+
+@pytest.mark.parametrize("curve", ["arib-std-b67", "smpte2084"])
+def test_videos_of_a_high_range_are_no_paler_than_others(tmp_path, curve):
+    """Bright colours are compressed by the mapping, to about a tenth less; taken as they are these are 60 levels off."""
+    video = coloured(tmp_path, HIGH.format(curve), "bt2020", curve, "bt2020nc")
+    assert is_high_range(video)
+    assert np.abs(stripes(tmp_path, video) - COLOURS).max() <= 16
