@@ -24,7 +24,7 @@ from nerfvol.octree.io import save_octree
 from nerfvol.octree.tree import Octree
 from nerfvol.splats.io import save_splats
 from nerfvol.splats.splats import Splats
-from nerfvol.training.session import read_saved
+from nerfvol.training.saved import read_saved
 from tests.fixtures import scenes
 
 ODD: tuple[Any, ...] = (

@@ -118,7 +118,7 @@ MUTANTS = (
     M("nerfvol/cli/terminal.py", "            if not self.goes_on:\n                raise\n            self.silence()\n        except UnicodeEncodeError", "            raise\n        except UnicodeEncodeError", "cli/test_terminal.py", "| head ends a training"),
     M("nerfvol/octree/io.py", "        require_memory(n_vertices", "        (lambda *_: None)(n_vertices", "octree/test_io.py", "a bomb is tried"),
     M("nerfvol/training/prepare.py", "PREVIOUS if finished or not kept else UNFINISHED", "PREVIOUS", FAULTS, "a run without a model takes the place of one with"),
-    M("nerfvol/training/session.py", '("SIGINT", "SIGTERM", "SIGHUP")', '("SIGINT",)', FAULTS, "kill loses a run"),
+    M("nerfvol/training/clock.py", '("SIGINT", "SIGTERM", "SIGHUP")', '("SIGINT",)', FAULTS, "kill loses a run"),
     # ---------------------------------------------------------------- mathematics
     M("nerfvol/measure/metrics.py", "mse = float(np.mean(error * error, dtype=np.float64))", "mse = float(np.mean(np.abs(error), dtype=np.float64))", "measure/test_metrics.py", "PSNR of the absolute error"),
     M("nerfvol/measure/scores.py", "psnr(of[seen], truth[seen])", "psnr(of, truth)", MASKS, "masked pixels are scored"),
@@ -145,7 +145,7 @@ MUTANTS = (
     M("nerfvol/training/octree_schedule.py", "    if is_unbounded:\n        return as_set\n", "", "training/test_octree_schedule.py", "haze between photographs is pruned once"),
     M("nerfvol/training/octree_schedule.py", "for prunes in (config.prunes, once):", "for prunes in (once,):", "training/test_octree_schedule.py", "a long run has another schedule than the one set"),
     M("nerfvol/training/octree_end.py", "* (1 + loss)", "* (1 - loss)", "training/test_octree_trainer.py", "a last pruning that must gain"),
-    M("nerfvol/training/octree_trainer.py", "self.chosen.sparsity * min(1.0, progress / max(self.chosen.decay_from, 1e-9))", "self.chosen.sparsity", "training/test_octree_trainer.py", "haze forbidden from the first step"),
+    M("nerfvol/training/octree_step.py", "chosen.sparsity * min(1.0, progress / max(chosen.decay_from, 1e-9))", "chosen.sparsity", "training/test_octree_trainer.py", "haze forbidden from the first step"),
     M("nerfvol/training/convert.py", "budget - after - begun", "budget - begun", "training/test_convert.py", "a conversion's budget without writing and scoring"),
     M("nerfvol/kernels/csrc/around.cpp", "weight * basis[i] * missed", "basis[i] * missed", "starts/test_surfaces.py", "looks beside a surface count in full"),
     M("nerfvol/kernels/csrc/adjoint.h", "/ (kSparseKnee + w)", "/ kSparseKnee", "kernels/test_train.py", "sparsity that costs surfaces as much as haze"),

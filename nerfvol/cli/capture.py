@@ -189,7 +189,7 @@ def training_state(out: Path, scene: Path) -> str:
     from nerfvol.config.assemble import read_yaml
     from nerfvol.files.run_folder import CHECKPOINT, CONFIG
     from nerfvol.poses.make import REPORT
-    from nerfvol.training.session import read_saved
+    from nerfvol.training.saved import read_saved
 
     config, checkpoint, report = out / CONFIG, out / CHECKPOINT, scene / REPORT
     if not config.is_file() or not checkpoint.is_file():

@@ -130,10 +130,10 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
         # What pictures of the splats stand for is at hand.
         octree = convert.surfaces_of(model.splats, scene, training.cameras, background, options.level)
         return OctreeModel(convert.tuned_octree(octree, training, background, config, scored), metadata)
-    seen = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, SplatModel | PointModel):
-        octree = convert.octree_of(model.splats, seen, background, options.level, options.seed)
+        octree = convert.octree_of(model.splats, scene, cameras, background, options.level, options.seed)
         return OctreeModel(octree, metadata)
+    seen = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, FieldModel):
         octree = convert.octree_of_field(model, seen, background, options.level)
         if options.to == "octree":

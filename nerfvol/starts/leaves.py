@@ -102,14 +102,23 @@ def _levels(g: _Gaussians, scene: SceneBounds, cameras: Sequence[Camera], level:
     """(n,) the level of the leaves that each Gaussian is made of."""
     side = SCALES * np.sort(g.scales, axis=1)[:, 1]
     if cameras:
-        pixel = np.full(len(side), np.inf)
-        for camera in cameras:
-            lens = camera.intrinsics
-            np.minimum(pixel, np.linalg.norm(g.means - camera.position, axis=1) / max(lens.fx, lens.fy), out=pixel)
-        side = np.maximum(side, PIXELS * pixel)
+        side = np.maximum(side, PIXELS * np.sqrt(_pixel_squares(g.means, cameras)))
     longest = (2 * g.reach * g.scales.max(1)) / (2 * LARGEST_LATTICE * SPACING)
     wanted = np.round(np.log2(size / np.maximum(np.maximum(side, longest), 1e-300))).astype(np.int64)
     return np.clip(wanted, min(3 + scene.n_shells, level), scene.finest_levels(g.means, level))
+
+
+def _pixel_squares(points: Float, cameras: Sequence[Camera]) -> Float:
+    """(n,) square of a pixel's width, scene units, at each of ``points`` (n, 3): that of the camera where it is smallest."""
+    middle = np.mean([camera.position for camera in cameras], axis=0)
+    apart, nearest = points - middle, np.full(len(points), np.inf)
+    own = np.einsum("ni,ni->n", apart, apart)
+    for camera in cameras:
+        place, focal = camera.position - middle, max(camera.intrinsics.fx, camera.intrinsics.fy)
+        square = own - apart @ (2 * place)  # |a - b|^2 without a row of differences for each camera
+        square += place @ place
+        np.minimum(nearest, square * (1 / focal**2), out=nearest)
+    return np.maximum(nearest, 0)
 
 
 def _filled(

@@ -12,9 +12,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.config.field import DistillConfig
@@ -47,10 +48,10 @@ MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
 FITTED_VIEWS, FITTED_VIEWS_OF_OBJECTS = 100, 50
 """Pictures of the splats that their octree is fitted to, at most."""
-FITTED_STEPS = 160
+FITTED_STEPS = 144
 """Steps of the fit, which begins with the surfaces found (starts/surfaces.py): some two seconds on two cores."""
 LOOKS = 32
-"""Looks that tell surfaces from the free before the fit."""
+"""Pictures that tell surfaces from the free before the fit."""
 EMPTY = 0.02
 """Optical thickness along a leaf's side, at its densest corner, below which the leaf is left out before the fit."""
 FITTED_PIXELS = 400
@@ -64,13 +65,14 @@ LOOK_AGAIN, RESERVE_SHARE = 0.08, 0.3
 """Shares of a time budget: after the first, what comes after the training is measured anew; it is given the second at most."""
 
 FIT = {
-    "downscales": [1], "stage_ends": [1.0], "tiles": [320], "prunes": [1], "prune_steps": 20, "foreground_share": 0.9,
+    "downscales": [1], "stage_ends": [1.0], "tiles": [320], "prunes": [1], "prune_steps": 20, "foreground_share": 0.97,
     "colour_weight": 0.02, "distortion": 0.02, "rate_density": 0.3, "rate_dc": 0.07, "rate_sh": 0.006, "rate_decay": 0.1,
-    "decay_from": 0.2, "growing_error": 0.0, "tv_from": 0, "prune_weight": 0.005,
+    "decay_from": 0.2, "growing_error": 0.0, "tv_from": 0, "prune_weight": 0.005, "early_stop_eps": 0.02,
 }  # fmt: skip
 """Settings of the fit: one stage, and rates that fall from a fifth of it on."""
 
 Say = Callable[[str], object]
+T = TypeVar("T")
 
 
 def cameras_around(model: Model) -> list[Camera]:
@@ -91,12 +93,17 @@ def cameras_around(model: Model) -> list[Camera]:
 
 def seen_by(model: Model, cameras: Sequence[Camera], scene: SceneBounds, background: Sequence[float]) -> Dataset:
     """Pictures of a model as a dataset: what ``cameras`` see of it over ``background``, uint8."""
-    images = []
-    for camera in cameras:
-        picture = model.render(camera, background)["rgb"]
-        images.append(np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8))
+    images = [_bytes_of(model.render(camera, background)["rgb"]) for camera in cameras]
+    return _dataset(cameras, images, scene, model.kind)
+
+
+def _bytes_of(picture: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+
+
+def _dataset(cameras: Sequence[Camera], images: list[NDArray[np.uint8]], scene: SceneBounds, kind: str) -> Dataset:
     names = [f"view_{i:03d}" for i in range(len(cameras))]
-    return Dataset(list(cameras), images, names, scene, f"pictures of {model.kind}")
+    return Dataset(list(cameras), images, names, scene, f"pictures of {kind}")
 
 
 def scene_around(model: Model) -> SceneBounds:
@@ -108,26 +115,33 @@ def scene_around(model: Model) -> SceneBounds:
 def small_cameras(cameras: Sequence[Camera], scene: SceneBounds) -> list[Camera]:
     """As many of these as an octree is fitted to, evenly chosen, of about FITTED_PIXELS pixels."""
     most = FITTED_VIEWS if scene.is_unbounded else FITTED_VIEWS_OF_OBJECTS
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), most)).round().astype(int))
     longest = max(max(c.intrinsics.width, c.intrinsics.height) for c in cameras)
     factor = max(1, -(-longest // FITTED_PIXELS))
-    return [cameras[i].scaled(factor) if factor > 1 else cameras[i] for i in chosen]
+    return [camera.scaled(factor) if factor > 1 else camera for camera in evenly(cameras, most)]
+
+
+def evenly(items: Sequence[T], most: int) -> list[T]:
+    """At most ``most`` of these, the first and the last among them."""
+    chosen = np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int)
+    return [items[i] for i in np.unique(chosen)]
 
 
 def octree_of(
-    splats: Splats, seen: Dataset, background: Sequence[float], level: int | None = None, seed: int = 0
-) -> Octree:
-    """The octree of splats: leaves around them, fitted to ``seen``, pictures of them (:func:`seen_by`).
+    splats: Splats, scene: SceneBounds, cameras: Sequence[Camera], background: Sequence[float],
+    level: int | None = None, seed: int = 0,
+) -> Octree:  # fmt: skip
+    """The octree of splats: leaves around them, fitted to small pictures of them as ``cameras`` without their lenses see them.
 
     level: of the finest leaves, along the scene's inner cube; None: :func:`finest_level`.
 
     Raises:
         InputError: no splat lies in the scene's region, or none is seen.
     """
-    level = finest_level(seen.scene, seen.cameras) if level is None else level
-    octree = surfaces_of(splats, seen.scene, seen.cameras, background, level)
-    config = OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT)
-    trainer = OctreeTrainer(seen, background, config, seed, octree)
+    level = finest_level(scene, cameras) if level is None else level
+    views, images = looked_at(SplatModel(splats), small_cameras(cameras, scene), background)
+    octree = _with_surfaces(octree_around(splats, scene, cameras, level), views)
+    seen = _dataset([view.camera for view in views], images, scene, SplatModel.kind)
+    trainer = OctreeTrainer(seen, background, OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT), seed, octree)
     for step in range(FITTED_STEPS):
         trainer.step(step / FITTED_STEPS)
     return trainer.octree
@@ -141,23 +155,33 @@ def surfaces_of(
     level: as in :func:`octree_of`, which raises the same.
     """
     octree = octree_around(splats, scene, cameras, finest_level(scene, cameras) if level is None else level)
-    write_surfaces(octree, looked_at(SplatModel(splats), small_cameras(cameras, scene), background))
+    return _with_surfaces(
+        octree, looked_at(SplatModel(splats), evenly(small_cameras(cameras, scene), LOOKS), background)[0]
+    )
+
+
+def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:
+    """Of splats as they stand, what LOOKS of ``views`` tell; without the leaves that are empty then."""
+    write_surfaces(octree, evenly(views, LOOKS))
     solid = thickness(octree) >= EMPTY
     return octree.prune(solid)[0] if solid.any() else octree
 
 
-def looked_at(model: Model, cameras: Sequence[Camera], background: Sequence[float]) -> list[Seen]:
-    """What LOOKS of ``cameras``, evenly chosen, see of a model, with distances, as pinholes."""
-    views = []
-    for i in np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), LOOKS)).round().astype(int)):
-        lens = cameras[i].intrinsics
-        camera = cameras[i].through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
+def looked_at(
+    model: Model, cameras: Sequence[Camera], background: Sequence[float]
+) -> tuple[list[Seen], list[NDArray[np.uint8]]]:
+    """What ``cameras`` see of a model, with distances, as pinholes; and the same as pictures over ``background``."""
+    views, images = [], []
+    for given in cameras:
+        lens = given.intrinsics
+        camera = given.through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
         image = model.render(camera, background, ("rgb", "opacity", "median_depth"))
         opacity = image["opacity"]
         through = (1 - opacity)[..., None] * np.asarray(background, np.float32)
         rgb = (image["rgb"] - through) / np.maximum(opacity, 1 / 255)[..., None]
         views.append(Seen(camera, rgb, opacity, image["median_depth"]))
-    return views
+        images.append(_bytes_of(image["rgb"]))
+    return views, images
 
 
 def octree_of_field(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,15 +23,14 @@ from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
 from nerfvol.measure.leaf_width import visible_widths
-from nerfvol.octree import codec
-from nerfvol.octree.rows import convert_rows, sh_slots
 from nerfvol.octree.topology import MAX_LEVEL, Transfer
 from nerfvol.octree.tree import Octree
 from nerfvol.starts.fog import low_density_octree
 from nerfvol.starts.visible import ENOUGH_VIEWS, solid
 from nerfvol.training.appearance import Appearance, small_picture
-from nerfvol.training.memory import OctreePlan, splits_within
-from nerfvol.training.octree_end import FINAL_PRUNE_WEIGHTS, FINAL_TILES, outcome, pruned_at_the_end
+from nerfvol.training.growing_octree import GrowingOctree
+from nerfvol.training.memory import OctreePlan
+from nerfvol.training.octree_end import FINAL_PRUNE_WEIGHTS, FINAL_TILES, outcome, pruned_at_the_end, seconds_to_write
 from nerfvol.training.octree_schedule import (
     FINE_LEVEL,
     Stages,
@@ -42,26 +40,18 @@ from nerfvol.training.octree_schedule import (
     prune_steps,
     stages_for,
 )
+from nerfvol.training.octree_step import losses_at, random_background, rates_at
 from nerfvol.views import OctreeModel, render_image
 
-BACKGROUND_STREAM = 2
-"""Stream of random numbers of the random background of photographs; TileBank has 0 and 1."""
 FEWEST_STEPS = 5000
 """Before a run with a time budget may end early, however few its tiles."""
-SECONDS_TO_WRITE = 0.5
-"""... and read an octree, and to look at it; plus, a vertex, ..."""
-PACKED_TIMES, PACKED_SAMPLE = 8.0, 50_000
-"""... so many times what packing it takes, as measured on so many vertices: the last pruning, packing, reading and
-prefiltering of a fox of 1.2 million leaves took 17.6 CPU seconds, its packing about 3."""
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees are in memory while one is made."""
 MOST_LEVELS_AT_ONCE = 2
 """Where stages are left out: more would split haze that was never pruned."""
-BETA = 0.98
-"""Memory, per step, of RMSprop's second moments."""
 
 
-class OctreeTrainer:
+class OctreeTrainer(GrowingOctree):
     """Optimises an octree on a dataset, from a given one or one of low density; a phase (training.phase.Phase).
 
     ``progress`` runs from 0 to 1 and drives every schedule. ``plan``: how large the octree may become; None: no bound.
@@ -85,8 +75,8 @@ class OctreeTrainer:
         config, self.chosen = config.for_scene(dataset.scene), SceneChoices.of(config, dataset.scene)
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
         self.appearance = appearance or Appearance(len(dataset), "off")
-        self.octree = octree if octree is not None else self._low_density_start()
-        self.state = ops.TrainState(self.octree)
+        start = low_density_octree(dataset, config.levels[0], self.chosen.sh_degree) if octree is None else octree
+        super().__init__(start, plan.max_leaves if plan else None)
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
@@ -95,17 +85,11 @@ class OctreeTrainer:
         self.stage_steps = np.zeros(len(config.levels), np.int64)
         self.cursors = Cursors()
         self.prunings = 0
-        self.tiles_seen = 0
         self.bank: TileBank | None = None
         self.plan = plan
-        self.max_leaves = plan.max_leaves if plan else None
-        """Bound on splitting, where memory is short; None: none."""
         self.steps = config.steps
         drawn = config.tiles[-1] * (config.foreground_share or 1.0)
         self.most_steps = max(FEWEST_STEPS, config.most_epochs * plan.foreground_tiles / drawn) if plan else math.inf
-
-    def _low_density_start(self) -> Octree:
-        return low_density_octree(self.dataset, self.config.levels[0], self.chosen.sh_degree)
 
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
@@ -130,12 +114,8 @@ class OctreeTrainer:
         return f"{self.octree.n_leaves:,} leaves"
 
     def seconds_to_write(self) -> float:
-        """In compact storage, with the last pruning before and the reading after; measured, for machines are shared."""
-        octree, n = self.octree, min(self.octree.n_vertices, PACKED_SAMPLE)
-        started = time.perf_counter()
-        codec.encode(octree.density[:n], octree.values[:n][:, sh_slots(octree.sh_degree)])
-        packing = (time.perf_counter() - started) * octree.n_vertices / n
-        return SECONDS_TO_WRITE + PACKED_TIMES * packing
+        """See Phase."""
+        return seconds_to_write(self.octree)
 
     def needs_images(self) -> bool:
         """Until the tiles at hand serve to the end."""
@@ -171,14 +151,11 @@ class OctreeTrainer:
 
     def state_dict(self) -> dict:
         """Everything an exact continuation needs: arrays, numbers and strings."""
-        t, s = self.octree, self.state
         return {
-            "node_mask": t.node_mask, "leaf_mask": t.leaf_mask, "values": t.values, "moments": s.moments,
-            "origin": t.origin, "size": t.size, "density_scale": t.density_scale, "sh_degree": t.sh_degree,
-            "max_weight": s.max_weight, "error": s.error, "footprint": s.footprint,
+            **self.leaves_saved(),
             "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
             "stage_steps": self.stage_steps,
-            "keeps_solid": self.keeps_solid, "prunings": self.prunings, "tiles_seen": self.tiles_seen,
+            "keeps_solid": self.keeps_solid, "prunings": self.prunings,
             "cursors": dataclasses.asdict(self.cursors), "appearance": self.appearance.state_dict(),
         }  # fmt: skip
 
@@ -188,20 +165,8 @@ class OctreeTrainer:
         Raises:
             InputError: its arrays do not fit each other.
         """
-        octree = Octree(
-            state["node_mask"], state["leaf_mask"], origin=state["origin"], size=state["size"],
-            sh_degree=state["sh_degree"], density_scale=state["density_scale"],
-        )  # fmt: skip
-        if np.shape(state["values"]) != octree.values.shape or np.shape(state["moments"]) != octree.values.shape:
-            raise InputError("checkpoint: values and moments do not fit the octree's topology")
-        octree.values = np.array(state["values"], dtype=np.float32)
-        self.octree = octree
-        self.state = ops.TrainState(octree, np.array(state["moments"], dtype=np.float32))
-        for name in ("max_weight", "error", "footprint"):
-            if np.shape(state[name]) != (octree.n_leaves,):
-                raise InputError(f"checkpoint: {name} does not fit the octree's {octree.n_leaves} leaves")
-            setattr(self.state, name, np.array(state[name], dtype=np.float32))
-        for name in ("stage", "first_stage", "steps_done", "prunings", "tiles_seen"):
+        self.load_leaves(state)
+        for name in ("stage", "first_stage", "steps_done", "prunings"):
             setattr(self, name, int(state[name]))
         self.keeps_solid = bool(state.get("keeps_solid", False))
         self.stage_steps = np.array(state.get("stage_steps", self.stage_steps), np.int64)
@@ -227,20 +192,9 @@ class OctreeTrainer:
             self.bank = None
         if self.bank is None:
             self.bank = self._make_bank()
-        fade = c.regulariser_decay**progress
-        smooth = fade if self.steps_done >= self.chosen.tv_from else 0.0
-        options = ops.LossOptions(
-            background=self._random_background(),
-            colour=c.colour_weight * fade,
-            distortion=c.distortion * fade,
-            sparsity=self.chosen.sparsity * min(1.0, progress / max(self.chosen.decay_from, 1e-9)),
-            tv_density=self.chosen.tv_density * smooth,
-            tv_sh=self.chosen.tv_sh * smooth,
-            early_stop_eps=c.early_stop_eps,
-        )
-        late = max(0.0, progress - self.chosen.decay_from) / (1 - self.chosen.decay_from)
-        rate = self.chosen.rate_decay**late
-        rates = ops.Rates(density=c.rate_density * rate, dc=c.rate_dc * rate, sh=c.rate_sh * rate, beta=BETA)
+        smooth = self.steps_done >= self.chosen.tv_from
+        options = losses_at(progress, c, self.chosen, self._random_background(), smooth)
+        rates = rates_at(progress, c, self.chosen)
         batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
         self.steps_done += 1
@@ -255,10 +209,7 @@ class OctreeTrainer:
         """
         if not self.dataset.scene.is_unbounded:
             return self.background
-        random = np.random.Generator(
-            np.random.Philox(np.random.SeedSequence([self.seed, BACKGROUND_STREAM, self.steps_done]))
-        )
-        return tuple(random.random(3).tolist())
+        return random_background(self.seed, self.steps_done)
 
     def _make_bank(self) -> TileBank:
         dataset, seen = self.dataset, self.appearance
@@ -288,7 +239,7 @@ class OctreeTrainer:
                 break
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
         if self.stage + 1 == len(c.levels) and c.final_sh_degree > self.octree.sh_degree:
-            self._grow_sh(c.final_sh_degree)
+            self.grow_sh(c.final_sh_degree)
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
             self.cursors = Cursors()
@@ -301,16 +252,7 @@ class OctreeTrainer:
         c, level = self.config, self.config.levels[self.stage]
         split = footprint > (c.subdivide_pixels if level >= FINE_LEVEL else c.whole_pixels)
         finest = self.dataset.scene.finest_levels(self.octree.leaf_centers(), level)
-        split &= self.octree.leaf_level < np.minimum(finest, MAX_LEVEL)
-        split &= holds_share(error, share)
-        split = splits_within(split, error, self.max_leaves)
-        return self._change(*self.octree.subdivide(split)) if split.any() else None
-
-    def _grow_sh(self, degree: int) -> None:
-        """The same field with more bands, which begin at zero."""
-        moments = convert_rows(self.state.moments, self.octree.sh_degree, degree)
-        self.octree = self.octree.with_sh_degree(degree)
-        self.state = ops.TrainState(self.octree, moments)
+        return self.split(split & (self.octree.leaf_level < np.minimum(finest, MAX_LEVEL)), error, share)
 
     def _stages(self) -> Stages:
         """Those that the run has the steps for at the pace so far; pictures of half the size have a quarter of the tiles."""
@@ -348,7 +290,7 @@ class OctreeTrainer:
             if 1 - self._needed(c.prune_weight).mean() >= WORTH_PRUNING:
                 error, footprint = self.prune()
             if not self.chosen.growing_error or self._split(error, footprint, self.chosen.growing_error) is None:
-                self._forget_statistics()
+                self.forget_statistics()
             self.prunings += 1
 
     def _needed(self, weight: float) -> np.ndarray:
@@ -367,11 +309,6 @@ class OctreeTrainer:
             needed |= self.state.footprint == 0
         return needed
 
-    def _forget_statistics(self) -> None:
-        """Forgets what rays needed so far."""
-        self.tiles_seen = 0
-        self.state.reset_statistics(self.octree.n_leaves)
-
     def prune(self) -> tuple[np.ndarray, np.ndarray]:
         """Removes leaves that no ray needed; error and footprint of those that stay, (n_leaves,) each.
 
@@ -385,7 +322,7 @@ class OctreeTrainer:
                 "octree.colour_weight and octree.distortion"
             )
         error, footprint = self.state.error[keep], self.state.footprint[keep]
-        self._change(*self.octree.prune(keep))
+        self.change(*self.octree.prune(keep))
         return error, footprint
 
     def finish(self) -> Octree:
@@ -404,18 +341,3 @@ class OctreeTrainer:
         del self.state, tiles
         return_free_memory()
         return pruned_at_the_end(self.octree, needed, batch, self.background, self.config.final_prune_loss)
-
-    def _change(self, octree: Octree, transfer: Transfer) -> Transfer:
-        self.octree = octree  # the old values go before the moments follow
-        self.state = ops.TrainState(octree, transfer.vertices(self.state.moments))
-        self.tiles_seen = 0
-        return transfer
-
-
-def holds_share(error: np.ndarray, share: float) -> np.ndarray:
-    """The fewest entries of ``error`` (n,) that together hold ``share`` of its sum: (n,) bool."""
-    order = np.argsort(-error, kind="stable")
-    held = np.cumsum(error[order], dtype=np.float64)
-    chosen = np.zeros(len(error), dtype=bool)
-    chosen[order[: 1 + np.searchsorted(held, share * held[-1])]] = True
-    return chosen

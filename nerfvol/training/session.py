@@ -8,8 +8,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,96 +19,32 @@ from nerfvol.cameras.paths import describe_orbit
 from nerfvol.config.training import Config
 from nerfvol.datasets.images import composite_average
 from nerfvol.defaults import WHITE
-from nerfvol.errors import InputError, shown
+from nerfvol.errors import InputError
 from nerfvol.files import pictures, run_folder
 from nerfvol.files.atomic import ensure_writable_folder
-from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
-from nerfvol.kernels import ops
+from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.kernels.state import StepReport
-from nerfvol.machine import process_seconds, return_free_memory
-from nerfvol.measure.metrics import ssim
+from nerfvol.machine import return_free_memory
 from nerfvol.medium.model import MediumModel
 from nerfvol.models import Model
 from nerfvol.neural import FieldModel
-from nerfvol.training.appearance import fitting_factor
+from nerfvol.training.clock import Clock, first_signal_noted
 from nerfvol.training.compiled_field import compiled_refusal
+from nerfvol.training.finishing import seconds_to_finish, seconds_to_score
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder
 from nerfvol.views import OctreeModel, SplatModel
 
-RESERVE_SHARE = 0.2
-"""Of a time budget, the most that is kept for writing and scoring."""
-EXPECTED_SECONDS_TO_WRITE = 2.0
-"""Of an octree, before there is one that tells ..."""
-SECONDS_TO_WRITE = 0.5
-"""... and of all else."""
 PREVIEW_SHARE, PREVIEW_SECONDS = 0.01, 0.08
 """Of a time budget, what previews may take together; and for the first one, before it was measured."""
-TABLE_SECONDS = 0.008
-"""For a training photograph's row in the table of photographs, besides its small picture."""
 LOOK_AGAIN = 0.08
 """Of a time budget: as often, at most, is the time to finish estimated anew because a representation has grown."""
-FIT_SECONDS = 0.5
-"""For a held-out view's pose, where cameras are refined."""
 RUNNING = 0.98
 """Memory, per step, of the running error."""
-
-
-PHASES = ("field", "octree", "splats", "medium", "done")
-_STATE = {
-    "elapsed": float, "phase_started": float, "running": float, "log_bytes": int, "results": dict, "steps": dict,
-    "trainer": dict,
-}  # fmt: skip
-
 
 Say = Callable[[str], object]
 Watch = Callable[["Run", Phase, bool], object]
 """Sees a run, its phase after a step, and whether that step began a stage."""
-
-
-class Clock:
-    """Seconds of wall clock that a run has used, over all its sessions."""
-
-    def __init__(self, started: float | None, spent: float) -> None:
-        now = time.perf_counter()
-        self._zero = (now - process_seconds() if started is None else started) - spent
-
-    def elapsed(self) -> float:
-        """Seconds so far, those of earlier sessions included."""
-        return time.perf_counter() - self._zero
-
-    def exclude(self, seconds: float) -> None:
-        """So many of the last seconds do not count: the run stood still."""
-        self._zero += seconds
-
-
-def read_saved(path: Path) -> dict[str, Any]:
-    """The state in a run's checkpoint, with everything that a continuation looks up in it.
-
-    Raises:
-        InputError: there is no such file, it is damaged, or no checkpoint of a training run.
-    """
-    state = load_checkpoint(path)
-    phase = state.get("phase")
-    needed = {"steps"} if phase == "done" else set(_STATE)
-    if not (isinstance(phase, str) and phase in PHASES and needed <= state.keys()):
-        raise InputError(f"{path} is no checkpoint of a training run")
-    for name, kind in _STATE.items() if phase != "done" else ():
-        if not isinstance(state[name], kind):
-            raise InputError(f"{path} is damaged: its {name} is {shown(state[name])}")
-    if phase != "done":
-        _check_numbers(path, state)
-    return state
-
-
-def _check_numbers(path: Path, state: dict[str, Any]) -> None:
-    """InputError where a number of the state is none that a run can go on with."""
-    for name in ("elapsed", "phase_started"):
-        if not 0 <= state[name] < math.inf:
-            raise InputError(f"{path} is damaged: its {name} is {shown(state[name])}")
-    steps = state["steps"]
-    if state["log_bytes"] < 0 or not all(type(n) is int and n >= 0 and name in PHASES for name, n in steps.items()):
-        raise InputError(f"{path} is damaged: its counts are {shown(state['log_bytes'])} and {shown(steps)}")
 
 
 class Run:
@@ -317,26 +251,16 @@ class Run:
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:
-        """The first Ctrl-C, SIGTERM (``kill``, a batch system's end) or SIGHUP (a closed terminal) only sets a flag, so that
-        the step in progress is finished; a second one ends at once. What is ignored, as nohup does, stays so."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
+        """The first signal to end only sets a flag, so that the step in progress is finished (:func:`first_signal_noted`)."""
 
-        def note(number: int, frame: Any) -> None:
-            if self.interrupted:
-                raise KeyboardInterrupt
-            self.interrupted = True
-            self.say("\nfinishing the step and saving (again: stop at once)")
+        def note() -> bool:
+            first, self.interrupted = not self.interrupted, True
+            if first:
+                self.say("\nfinishing the step and saving (again: stop at once)")
+            return first
 
-        numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-        caught = [n for n in numbers if n == signal.SIGINT or signal.getsignal(n) is not signal.SIG_IGN]
-        before = [(number, signal.signal(number, note)) for number in caught]
-        try:
+        with first_signal_noted(note):
             yield
-        finally:
-            for number, handler in before:
-                signal.signal(number, handler)
 
     def interruption(self, phase: Phase) -> KeyboardInterrupt:
         """What to raise once a checkpoint was written after Ctrl-C; says where the run is and how to go on."""
@@ -367,40 +291,11 @@ class Run:
         return SplatModel(frame.splats_back(model.splats), {**model.metadata, "near": model.near * frame.scale})
 
     def _time_to_finish(self, phase: Phase | None = None) -> float:
-        """Seconds to keep for writing, reading the views and scoring.
-
-        Reading took a time at the start, scoring and drawing are measured on one view; without a phase, the rest is guessed.
-        """
         if self.config.time_budget is None:
             return 0.0
         if self._scoring is None:
-            image = self.data.first.composited(0, self.background)
-            self._scoring = _seconds(ssim, image, image) / ops.get_threads()  # so many views are scored side by side
-        rows = len(self.data.training) if self.data.training.scene.is_unbounded else 0
-        small = 0.0
-        if phase is None:
-            rendering = 0.1e-6 * self.data.first.images[0].size / 3
-            writing = EXPECTED_SECONDS_TO_WRITE if self.config.representation == "octree" else SECONDS_TO_WRITE
-        else:
-            rendering = _seconds(phase.picture, self.data.held_out.cameras[0])
-            writing = phase.seconds_to_write()
-            if rows:
-                camera = self.data.training.cameras[0]
-                lens = camera.intrinsics
-                small = _seconds(phase.picture, camera.scaled(fitting_factor(lens.width, lens.height)))
-        return min(
-            writing
-            + self.data.reading
-            + (TABLE_SECONDS + small) * rows
-            + 1.1 * len(self.data.held_out) * (self._scoring + rendering + FIT_SECONDS * self.config.refine_poses),
-            RESERVE_SHARE * self.config.time_budget,
-        )
-
-
-def _seconds(function: Callable[..., object], *arguments: object) -> float:
-    started = time.perf_counter()
-    function(*arguments)
-    return time.perf_counter() - started
+            self._scoring = seconds_to_score(self.data.first.composited(0, self.background))
+        return seconds_to_finish(self.config, self.data, self._scoring, phase)
 
 
 def decibels(squared_error: float) -> float:

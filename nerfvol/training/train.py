@@ -41,6 +41,7 @@ from nerfvol.native import need_torch
 from nerfvol.octree.tree import Octree
 from nerfvol.starts.exposures import measure_exposures
 from nerfvol.training.appearance import Appearance
+from nerfvol.training.clock import Clock
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.few_views import few_views
 from nerfvol.training.field_start import make_field_trainer, make_final_trainer
@@ -50,7 +51,8 @@ from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
 from nerfvol.training.refined import write_refined
-from nerfvol.training.session import Clock, Run, Say, Watch, read_saved
+from nerfvol.training.saved import read_saved
+from nerfvol.training.session import Run, Say, Watch
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at, orbit
 from nerfvol.errors import InputError
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
 from nerfvol.rotations import rotations
 from nerfvol.splats.splats import Splats
 from nerfvol.starts import leaves
-from nerfvol.starts.leaves import BLUR, FAINTEST, PIXELS, SCALES, SPACING, WIDEST, octree_around
+from nerfvol.starts.leaves import BLUR, FAINTEST, PIXELS, SCALES, SPACING, WIDEST, _pixel_squares, octree_around
 
 SCENE = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, False)
 
@@ -101,3 +101,20 @@ def test_with_and_without_compiled_kernels_the_leaves_hold_the_same(monkeypatch)
     theirs = octree_around(splats, SCENE, [], 7)
     assert np.array_equal(ours.corners, theirs.corners)
     np.testing.assert_allclose(ours.values, theirs.values, rtol=2**-23, atol=1e-9)
+
+
+def test_a_pixel_is_as_wide_far_from_the_origin():
+    """Squares are taken apart around the cameras' middle: what that loses is a rounding of the largest term over the result."""
+    rng = np.random.default_rng(0)
+    offset = np.array([4e5, 5e6, 100.0])
+    points = offset + rng.normal(size=(200, 3))
+    lenses = [Intrinsics(64, 48, focal, focal / 2, 32, 24) for focal in (50.0, 80.0, 200.0)]
+    cameras = [Camera(lens, look_at(offset + 3 * rng.normal(size=3), offset, (0.0, 0.0, 1.0))) for lens in lenses]
+    apart = np.stack([np.linalg.norm(points - c.position, axis=1) / c.intrinsics.fx for c in cameras])
+    middle = np.mean([c.position for c in cameras], axis=0)
+    largest = max(
+        np.linalg.norm(points - middle, axis=1).max(), *(np.linalg.norm(c.position - middle) for c in cameras)
+    )
+    # Positions themselves are rounded to half a unit of the offset; differences of them by that much more.
+    bound = 16 * np.finfo(float).eps * (2 * largest) ** 2 + 4 * np.spacing(5e6) * 2 * largest
+    assert np.abs(_pixel_squares(points, cameras) - apart.min(0) ** 2).max() * 50**2 < bound * 4

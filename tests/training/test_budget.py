@@ -14,7 +14,7 @@ from nerfvol.config.field import FieldConfig
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
-from nerfvol.training import field_trainer, octree_trainer, prepare, session
+from nerfvol.training import clock, field_trainer, finishing, octree_end, prepare, session
 from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory import OctreePlan, gib, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
@@ -27,8 +27,8 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     """More steps than fit: by a clock that goes on 20 ms at every look, each phase gets its share and is finished."""
     looks = iter(range(10**9))
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 0.02 * next(looks))
-    monkeypatch.setattr(session, "EXPECTED_SECONDS_TO_WRITE", 100.0)
-    monkeypatch.setattr(octree_trainer, "SECONDS_TO_WRITE", 100.0)
+    monkeypatch.setattr(finishing, "EXPECTED_SECONDS_TO_WRITE", 100.0)
+    monkeypatch.setattr(octree_end, "SECONDS_TO_WRITE", 100.0)
     config = settings(tiny_scene, tmp_path, init=init, time_budget=10.0, checkpoint_every=1000)
     config.octree.steps = config.field.steps = 10**9
     start(config)
@@ -142,9 +142,9 @@ def test_a_budget_that_is_over_before_the_start(tmp_path, tiny_scene):
 def test_the_time_of_earlier_sessions_counts(monkeypatch):
     """Also what passed before a process came so far as to make a clock."""
     monkeypatch.setattr(session.time, "perf_counter", lambda: 100.0)
-    monkeypatch.setattr(session, "process_seconds", lambda: 7.0)
-    assert session.Clock(98.0, 30.0).elapsed() == pytest.approx(32)
-    assert session.Clock(None, 30.0).elapsed() == pytest.approx(37)
+    monkeypatch.setattr(clock, "process_seconds", lambda: 7.0)
+    assert clock.Clock(98.0, 30.0).elapsed() == pytest.approx(32)
+    assert clock.Clock(None, 30.0).elapsed() == pytest.approx(37)
 
 
 def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):

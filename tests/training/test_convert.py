@@ -51,7 +51,7 @@ def converted():
         for threads in (1, 2):
             before = ops.get_threads()
             ops.set_threads(threads)
-            octrees.append(octree_of(discs.splats, seen, WHITE, LEVEL))
+            octrees.append(octree_of(discs.splats, SCENE, seen.cameras, WHITE, LEVEL))
             ops.set_threads(before)
     return discs, seen, octrees
 
@@ -145,3 +145,20 @@ def test_a_time_budget_is_that_of_the_whole_command(monkeypatch, begun, ends):
         assert len(phase.progress) == 1
     else:
         assert ends <= phase.now < ends + 3 and phase.progress == sorted(phase.progress) and phase.progress[-1] > 0.8
+
+
+def test_what_is_looked_at_are_the_pictures_of_the_fit(converted):
+    """One drawing tells surfaces and is fitted to: its picture is the one that :func:`seen_by` takes, and the colours without
+    background and the opacity beside it make it again, to half a level and a rounding of 1/255 where nothing is opaque."""
+    discs, seen, _ = converted
+    views, images = convert.looked_at(discs, seen.cameras, WHITE)
+    for view, image, taken in zip(views, images, seen.images, strict=True):
+        np.testing.assert_array_equal(image, taken)
+        opacity = view.opacity[..., None]
+        again = 255 * (view.rgb * opacity + (1 - opacity) * np.array(WHITE))
+        assert np.abs(again - image).max() < 0.5 + 1
+    assert [len(convert.evenly(range(n), 5)) for n in (3, 5, 9)] == [3, 5, 5] and convert.evenly(range(9), 3) == [
+        0,
+        4,
+        8,
+    ]

@@ -10,7 +10,7 @@ import pytest
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
-from nerfvol.training import session
+from nerfvol.training import finishing, session
 from nerfvol.training.octree_schedule import (
     ENOUGH_TILES,
     ENOUGH_TILES_OF_PHOTOGRAPHS,
@@ -122,7 +122,7 @@ def test_a_slow_clock_reaches_the_finest_stage(tmp_path, tiny_scene, monkeypatch
     and end in the finest; the fast one in all of them."""
     steps = []
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: seconds_a_step * (steps[-1] if steps else 0))
-    monkeypatch.setattr(session, "EXPECTED_SECONDS_TO_WRITE", 100.0)
+    monkeypatch.setattr(finishing, "EXPECTED_SECONDS_TO_WRITE", 100.0)
     monkeypatch.setattr(OctreeTrainer, "seconds_to_write", lambda self: 100.0)
     monkeypatch.setattr(session.Run, "claim", claim_and_count(session.Run.claim, steps))
     config = settings(tiny_scene, tmp_path, time_budget=10.0, checkpoint_every=1000)

@@ -25,7 +25,7 @@ from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.native import native
 from nerfvol.octree.io import save_octree
 from nerfvol.region import SceneBounds
-from nerfvol.training import session, splat_schedule
+from nerfvol.training import finishing, session, splat_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import SplatModel
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
@@ -245,7 +245,7 @@ def test_a_budget_ends(tmp_path, tiny_scene, monkeypatch):
     monkeypatch.setattr(session.time, "perf_counter", lambda: 0.01 * next(ticks))
     run = start(splat_settings(tiny_scene, tmp_path / "run", time_budget=8.0), started=0.0)
     last = log_of(run)[-1]
-    assert last["progress"] >= 1 and 8 * (1 - session.RESERVE_SHARE) - 0.5 < last["seconds"] < 8
+    assert last["progress"] >= 1 and 8 * (1 - finishing.RESERVE_SHARE) - 0.5 < last["seconds"] < 8
     assert metrics_of(run)["steps"]["splats"] == last["step"] > 44  # the seconds count, not the setting
 
 

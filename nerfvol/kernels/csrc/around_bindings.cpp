@@ -1,12 +1,10 @@
 // Python bindings of making an octree around splats. Values were checked in Python; sizes are checked here.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
-#include <stdexcept>
 
 #include "around.h"
+#include "arrays.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -14,16 +12,10 @@ using namespace nerfvol;
 
 namespace {
 
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
 using Numbers = In<int64_t, nb::ndim<1>>;
 using Doubles = In<double, nb::ndim<1>>;
 using Points = In<double, nb::shape<-1, 3>>;
 using Frames = In<double, nb::shape<-1, 3, 3>>;
-
-void require(bool fits, const char* what) {
-    if (!fits) throw std::invalid_argument(what);
-}
 
 GaussianAxes gaussians_of(const Points& means, const Frames& axes, const Doubles& side) {
     require(axes.shape(0) == means.shape(0) && side.shape(0) == means.shape(0), "there must be one row a Gaussian");

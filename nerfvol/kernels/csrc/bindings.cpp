@@ -1,8 +1,5 @@
 // Python bindings. Shapes and ranges were checked by nerfvol/kernels/ops.py; types and layouts are checked here.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -14,6 +11,7 @@
 #include <vector>
 
 #include "arena.h"
+#include "arrays.h"
 #include "batch.h"
 #include "pool.h"
 #include "field_bindings.h"
@@ -30,14 +28,10 @@ namespace nb = nanobind;
 using namespace nb::literals;
 using namespace nerfvol;
 
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
 using Rows = In<float, nb::ndim<2>>;
 template <class T> using Maybe = std::optional<T>;
 
 namespace {
-
-template <class T> auto pointer(const Maybe<T>& array) -> decltype(array->data()) { return array ? array->data() : nullptr; }
 
 // Holds the arrays of an octree for as long as the views of them are used.
 struct TreeArrays {

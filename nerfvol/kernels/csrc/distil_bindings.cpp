@@ -1,9 +1,5 @@
 // Python bindings of distilling. Values were checked in Python; sizes are checked here.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-
-#include <stdexcept>
-
+#include "arrays.h"
 #include "distil.h"
 
 namespace nb = nanobind;
@@ -11,13 +7,6 @@ using namespace nb::literals;
 using namespace nerfvol;
 
 namespace {
-
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-
-void require(bool fits, const char* what) {
-    if (!fits) throw std::invalid_argument(what);
-}
 
 void py_dilate_cells(In<int32_t, nb::shape<-1, 3>> cells, In<uint8_t, nb::ndim<1>> holds, Out<uint8_t, nb::ndim<1>> kept) {
     require(holds.shape(0) == cells.shape(0) && kept.shape(0) == cells.shape(0), "there must be one entry a cell");

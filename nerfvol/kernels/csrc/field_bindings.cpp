@@ -1,17 +1,15 @@
 // Python bindings of the operators on neural fields. Ranges were checked by nerfvol/kernels/field_ops.py; layouts are checked here.
 #include "field_bindings.h"
 
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <optional>
-#include <stdexcept>
 #include <tuple>
 #include <vector>
 
+#include "arrays.h"
 #include "tree.h"
 
 namespace nb = nanobind;
@@ -20,17 +18,9 @@ using namespace nerfvol;
 
 namespace {
 
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
 using Vectors = In<float, nb::shape<-1, 3>>;
 using Numbers = Out<float, nb::ndim<1>>;
 using Layer = std::tuple<int, int, bool, int>;  // in, out, relu, extra
-
-template <class T> auto pointer(const std::optional<T>& array) -> decltype(array->data()) { return array ? array->data() : nullptr; }
-
-void require(bool fits, const char* message) {
-    if (!fits) throw std::invalid_argument(message);
-}
 
 int64_t entries(const FieldShape& f) { return f.hashed ? f.start[f.levels] * f.features : 0; }
 

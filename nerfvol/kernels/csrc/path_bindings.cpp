@@ -1,13 +1,10 @@
 // Python binding of the path tracer. Values were checked in Python; sizes and indices are checked here.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 
 #include <optional>
-#include <stdexcept>
 #include <utility>
 
+#include "arrays.h"
 #include "path_scene.h"
 
 namespace nb = nanobind;
@@ -16,15 +13,10 @@ using namespace nerfvol;
 
 namespace {
 
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-using Out = nb::ndarray<double, nb::numpy, nb::c_contig, nb::device::cpu, nb::shape<-1, -1, 8>>;
+using Picture = Out<double, nb::shape<-1, -1, 8>>;
 using Rows = In<double, nb::shape<-1, 3>>;
 using Floats = In<float, nb::ndim<1>>;
 constexpr int kBrickSamples = 729;
-
-void require(bool fits, const char* what) {
-    if (!fits) throw std::invalid_argument(what);
-}
 
 PathTable table(const Rows& rows) {
     require(rows.shape(0) > 0, "a table is empty");
@@ -35,7 +27,7 @@ PathTable table(const Rows& rows) {
 void py_trace(In<double, nb::shape<16>> numbers, In<int64_t, nb::shape<5>> whole, In<int64_t, nb::ndim<1>> offsets, Floats samples,
               const std::optional<Floats>& attributes, In<double, nb::ndim<1>> brick_max, Rows albedo, Rows Le,
               In<double, nb::shape<-1, kLightColumns>> lights, In<double, nb::shape<16>> camera, int64_t spp, int64_t max_depth, bool jitter,
-              bool opaque_sky, uint64_t seed, std::pair<int64_t, int64_t> blocks, int first, Out out) {
+              bool opaque_sky, uint64_t seed, std::pair<int64_t, int64_t> blocks, int first, Picture out) {
     PathScene s{};
     PathMedium& m = s.medium;
     const double* x = numbers.data();

@@ -1,15 +1,13 @@
 // Python bindings of the operators on splats. Ranges were checked by nerfvol/kernels/splat_ops.py; layouts are checked here.
 #include "splat_bindings.h"
 
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <optional>
-#include <stdexcept>
 #include <vector>
 
+#include "arrays.h"
 #include "splat_rows.h"
 #include "tree.h"
 
@@ -19,19 +17,11 @@ using namespace nerfvol;
 
 namespace {
 
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
 using Params = In<float, nb::shape<-1, -1, 16>>;
 using Blocks = Out<float, nb::shape<-1, -1, 16>>;
 using PerGaussian = Out<float, nb::shape<-1, 16>>;
 using Picture = std::optional<Out<float, nb::ndim<2>>>;
 using Vectors = std::optional<Out<float, nb::shape<-1, -1, 3>>>;
-
-template <class T> auto pointer(const std::optional<T>& array) -> decltype(array->data()) { return array ? array->data() : nullptr; }
-
-void require(bool fits, const char* message) {
-    if (!fits) throw std::invalid_argument(message);
-}
 
 // The kernels load whole cache lines.
 template <class A> void require_lines(const A& array) {

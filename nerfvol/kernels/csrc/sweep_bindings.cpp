@@ -1,14 +1,11 @@
 // Python bindings of what prepares photographs and starting points. Values were checked in Python; sizes are checked here.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <optional>
-#include <stdexcept>
 #include <vector>
 
+#include "arrays.h"
 #include "neighbours.h"
 #include "sweep.h"
 #include "warp.h"
@@ -19,14 +16,8 @@ using namespace nerfvol;
 
 namespace {
 
-template <class T, class... Shape> using In = nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
-template <class T, class... Shape> using Out = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu, Shape...>;
 using Plane = In<float, nb::ndim<2>>;
 using Mask = In<uint8_t, nb::ndim<2>>;
-
-void require(bool fits, const char* what) {
-    if (!fits) throw std::invalid_argument(what);
-}
 
 // maps (m, k, 12), others (m, k) picture numbers, -1 = none; outputs one (height, width) a reference.
 void py_plane_sweep(const std::vector<Plane>& greys, const std::vector<std::optional<Mask>>& masks, In<int32_t, nb::ndim<1>> picture,

@@ -1,0 +1,66 @@
+"""How long a run with a time budget will take after its last step: writing, reading the views, scoring them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nerfvol.config.training import Config
+from nerfvol.kernels import ops
+from nerfvol.measure.metrics import ssim
+from nerfvol.training.appearance import fitting_factor
+from nerfvol.training.phase import Phase
+from nerfvol.training.prepare import Data
+
+RESERVE_SHARE = 0.2
+"""Of a time budget, the most that is kept for writing and scoring."""
+EXPECTED_SECONDS_TO_WRITE = 2.0
+"""Of an octree, before there is one that tells ..."""
+SECONDS_TO_WRITE = 0.5
+"""... and of all else."""
+TABLE_SECONDS = 0.008
+"""For a training photograph's row in the table of photographs, besides its small picture."""
+FIT_SECONDS = 0.5
+"""For a held-out view's pose, where cameras are refined."""
+
+
+def seconds_to_score(image: NDArray[np.float32]) -> float:
+    """What scoring a view of this image (H, W, 3) takes: so many views are scored side by side."""
+    return _seconds(ssim, image, image) / ops.get_threads()
+
+
+def seconds_to_finish(config: Config, data: Data, scoring: float, phase: Phase | None = None) -> float:
+    """Seconds to keep for writing, reading the views and scoring, of a run with a time budget.
+
+    Reading took a time at the start, ``scoring`` a view was measured, drawing is measured on one view; without a phase, the
+    rest is guessed.
+    """
+    rows = len(data.training) if data.training.scene.is_unbounded else 0
+    small = 0.0
+    if phase is None:
+        rendering = 0.1e-6 * data.first.images[0].size / 3
+        writing = EXPECTED_SECONDS_TO_WRITE if config.representation == "octree" else SECONDS_TO_WRITE
+    else:
+        rendering = _seconds(phase.picture, data.held_out.cameras[0])
+        writing = phase.seconds_to_write()
+        if rows:
+            camera = data.training.cameras[0]
+            lens = camera.intrinsics
+            small = _seconds(phase.picture, camera.scaled(fitting_factor(lens.width, lens.height)))
+    return min(
+        writing
+        + data.reading
+        + (TABLE_SECONDS + small) * rows
+        + 1.1 * len(data.held_out) * (scoring + rendering + FIT_SECONDS * config.refine_poses),
+        RESERVE_SHARE * (config.time_budget or math.inf),
+    )
+
+
+def _seconds(function: Callable[..., object], *arguments: object) -> float:
+    started = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - started
