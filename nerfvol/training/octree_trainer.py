@@ -71,6 +71,7 @@ class OctreeTrainer:
     rates = "octree.rate_density, octree.rate_dc and octree.rate_sh"
     previews = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
     preview_width = 200
+    timed_at = 1
 
     def __init__(
         self,

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from nerfvol.cameras.camera import Camera
 from nerfvol.cameras.paths import describe_orbit
 from nerfvol.config.training import Config
 from nerfvol.datasets.images import composite_average
@@ -301,10 +302,13 @@ class Run:
         """The first held-out view, small: truth next to what the phase has. A time budget is for training: what previews may
         take of it is bounded."""
         budget, started = self.config.time_budget, time.perf_counter()
-        if budget is not None and self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
-            return
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
+        if budget is not None:
+            if phase.timed_at > 1:
+                self._preview_cost = _seconds_of_picture(phase, camera.scaled(k))
+            if self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
+                return
         truth = np.divide(composite_average(image, self.background, k), 255, dtype=np.float32)
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
         path = self.folder / run_folder.PREVIEWS / f"{phase.name}_{round(100 * moment):03d}.png"
@@ -382,12 +386,12 @@ class Run:
             rendering = 0.1e-6 * self.data.first.images[0].size / 3
             writing = EXPECTED_SECONDS_TO_WRITE if self.config.representation == "octree" else SECONDS_TO_WRITE
         else:
-            rendering = _seconds(phase.picture, self.data.held_out.cameras[0])
+            rendering = _seconds_of_picture(phase, self.data.held_out.cameras[0])
             writing = phase.seconds_to_write()
             if rows:
                 camera = self.data.training.cameras[0]
                 lens = camera.intrinsics
-                small = _seconds(phase.picture, camera.scaled(fitting_factor(lens.width, lens.height)))
+                small = _seconds_of_picture(phase, camera.scaled(fitting_factor(lens.width, lens.height)))
         return min(
             writing
             + self.data.reading
@@ -395,6 +399,12 @@ class Run:
             + 1.1 * len(self.data.held_out) * (self._scoring + rendering + FIT_SECONDS * self.config.refine_poses),
             RESERVE_SHARE * self.config.time_budget,
         )
+
+
+def _seconds_of_picture(phase: Phase, camera: Camera) -> float:
+    """What a picture of the camera takes; see Phase.timed_at."""
+    k = min(phase.timed_at, camera.intrinsics.width, camera.intrinsics.height)
+    return k * k * _seconds(phase.picture, camera.scaled(k))
 
 
 def _seconds(function: Callable[..., object], *arguments: object) -> float:
