@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 MOST_RAYS = 32768
 """Of one step, while most of space is known to be empty."""
+FEW_WIDTH = 64
+"""Neurons of a layer, at least, where there are few training views: a wide network guesses better what none of them sees, with
+many views it only costs time."""
 SECONDS_TO_WRITE = 0.3
 """Of a field that is the product."""
 
@@ -118,7 +121,9 @@ class CompiledFieldTrainer:
         self.final, self.appearance = final, Appearance(len(dataset), "off")
         self.dataset, self.seed, self.domain = dataset, seed, domain
         self.few = len(dataset) <= config.few_views
-        shape = dataclasses.replace(config.shape, sh_degree=0) if self.few else config.shape
+        shape = config.shape
+        if self.few:
+            shape = dataclasses.replace(shape, sh_degree=0, width=max(shape.width, FEW_WIDTH))
         self.config = dataclasses.replace(config, shape=shape)
         self.background = (float(background[0]), float(background[1]), float(background[2]))
         self.state = FieldState(domain, shape, seed)

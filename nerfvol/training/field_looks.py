@@ -16,13 +16,13 @@ from nerfvol.kernels.field_ops import FieldState, Occupancy
 
 SWEEPS = (32, 64, 128)
 """After so many steps the whole region is looked at, one point a block of 2**3 cells ..."""
-THINNED = (160, 200, 240, 280, 320, 380, 440, 500, 600, 700, 850, 1000, 1300, 1600, 2000, 3000, 5000)
+THINNED = (160, 240, 320, 440, 600, 850, 1300, 2000, 3000, 5000)
 THIN_DECAY = 0.5
 """... after so many, every occupied cell, and what was seen of it before counts by this factor: haze of the first steps would
 stay occupied for thousands of steps, and be half of the samples; ..."""
 MOST_LOOKED = 1 << 18
 """... but so many of them at most, evenly chosen: those of photographs' haze would take seconds; ..."""
-PROBE_EVERY, PROBES = 64, 32768
+PROBE_EVERY, PROBES = 128, 32768
 """... and from the sweeps on, each so many steps, so many cells, half of them among the occupied ones."""
 
 

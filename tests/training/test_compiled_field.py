@@ -189,7 +189,8 @@ def test_rays_are_the_cameras_and_colours_the_images(compiled, dataset: Dataset)
 
 def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:
     trainer = trainer_of(dataset, dataclasses.replace(SMALL, few_views=8))
-    assert trainer.state.shape.sh_degree == 0 and trainer.few and not trainer_of(dataset).few
+    assert trainer.state.shape.sh_degree == 0 and trainer.state.shape.width == 64 > SMALL.shape.width
+    assert trainer.few and not trainer_of(dataset).few
     config, schedule = trainer.config, field_schedule
     assert (
         schedule.rates_at(config, True, 0, 0.0).table_decay
