@@ -132,6 +132,9 @@ def test_steps_along_rays_become_finer(compiled, dataset: Dataset) -> None:
     trainer.steps_done = 5000
     trainer.step()
     assert trainer.march.n_steps == 64
+    trainer.steps_done = 0
+    trainer.step()
+    assert trainer.march.n_steps == 10 and trainer.trained_field().march.n_steps == 64
 
 
 def test_a_picture_is_drawn_anew_where_cells_change_and_not_where_rays_do(compiled, dataset: Dataset) -> None:
