@@ -49,8 +49,8 @@ class FieldShape(Checked):
     """Cells along an edge of the coarsest grid."""
     hash_max: Count = 256
     """Cells along an edge of the finest grid."""
-    width: Count = 64
-    """Neurons of a hidden layer."""
+    width: Count = 32
+    """Neurons of a hidden layer; at least 64 where few views train by the compiled kernels."""
     depth: Count = 1
     """Hidden layers of the trunk."""
     skip: Annotated[int, at_least(0)] = 0
@@ -97,7 +97,7 @@ class FieldConfig(Checked):
     """Share of progress at which each stage ends."""
     samples_per_step: Count = 8192
     """Samples of one step: the number of rays follows from how many samples a ray has just now."""
-    march_steps: tuple[Annotated[int, at_least(8)], ...] = (256,)
+    march_steps: tuple[Annotated[int, at_least(8)], ...] = (384,)
     """Marching steps along the diagonal of the inner cube, one a stage."""
     sampler: Literal["occupancy", "importance"] = "occupancy"
     """Skip empty space, or stratified coarse samples and inverse-CDF fine samples as the paper does."""

@@ -92,11 +92,14 @@ class Dataset:
 
     def evenly(self, most: int) -> Dataset:
         """At most ``most`` of the views, evenly chosen, the first and the last among them; the same images."""
-        if len(self) <= most:
+        return self if len(self) <= most else self.chosen(evenly(len(self), most))
+
+    def chosen(self, views: Sequence[int]) -> Dataset:
+        """These views alone; the same images. All of them in order: the dataset itself."""
+        if list(views) == list(range(len(self))):
             return self
-        chosen = evenly(len(self), most)
-        cameras, images, names = ([column[i] for i in chosen] for column in (self.cameras, self.images, self.names))
-        masks = None if self.masks is None else [self.masks[i] for i in chosen]
+        cameras, images, names = ([column[i] for i in views] for column in (self.cameras, self.images, self.names))
+        masks = None if self.masks is None else [self.masks[i] for i in views]
         return replace(self, cameras=cameras, images=images, names=names, masks=masks)
 
     def smaller(self, k: int, background: Sequence[float]) -> Dataset:

@@ -24,6 +24,10 @@ CHUNK = 32768
 """Points of one evaluation of the field: what it takes and gives stays in the cache."""
 CHILDREN = 4
 """Of a cell's eight parts, those that hold a surface: what is reckoned with before they are looked at."""
+EVERYWHERE = (np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / 4
+"""Points of a cell that nothing is known of, in units of its side ..."""
+TETRAHEDRON = 0.25 + 0.5 * OFFSETS[OFFSETS.sum(1) % 2 == 0]
+"""... and of one of whose parent something is: its neighbours are kept too."""
 _FACES = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1  # the 26 neighbours of a cell
 
 
@@ -67,7 +71,7 @@ class Frame:
 
 def evaluate(function: Callable[[np.ndarray], np.ndarray], corners: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """``function`` of the points corners (n, 3) + offsets (p, 3) or (n, p, 3), in one call: (n, p, ...) float32."""
-    points = (corners[:, None] + offsets).astype(np.float32)
+    points = corners.astype(np.float32)[:, None] + offsets.astype(np.float32)
     return function(points.reshape(-1, 3)).reshape(*points.shape[:2], -1)
 
 
@@ -120,7 +124,7 @@ def finer_cells(
     levels, kept = np.repeat(level[split] + 1, 8), np.empty(len(parts), bool)
     for one in np.unique(levels):
         own, edge = np.flatnonzero(levels == one), frame.size / 2.0**one
-        thick = edge * largest_sigma(field, parts[own], frame.origin, edge, per_axis=2)
+        thick = edge * largest_sigma(field, parts[own], frame.origin, edge, TETRAHEDRON)
         kept[own] = dilated(parts[own], thick > -math.log1p(-config.empty_opacity))
     most = int(np.searchsorted(np.cumsum(kept.reshape(-1, 8).sum(1) - 1), room, side="right"))
     kept[8 * most :] = False
@@ -140,7 +144,7 @@ def _search(
     for level in range(start, frame.finest + 1):
         wanted = frame.wanted_level(level, cells)
         edge = frame.size / 2**level
-        sigmas = largest_sigma(field, cells, frame.origin, edge, per_axis=4 if level == start else 2)
+        sigmas = largest_sigma(field, cells, frame.origin, edge, EVERYWHERE if level == start else TETRAHEDRON)
         # Thickness of the leaf this cell would be cut into.
         thickness = sigmas * (frame.size / 2.0 ** np.maximum(wanted, level))
         kept = dilated(cells, thickness > threshold)
@@ -155,13 +159,12 @@ def _search(
     return np.concatenate(levels), np.concatenate(done)
 
 
-def largest_sigma(field: PointField, cells: np.ndarray, origin: np.ndarray, edge: float, per_axis: int) -> np.ndarray:
-    """Largest coefficient among per_axis**3 evenly spaced points in each cell: (n,) float32.
+def largest_sigma(field: PointField, cells: np.ndarray, origin: np.ndarray, edge: float, points: np.ndarray) -> np.ndarray:
+    """Largest coefficient among ``points`` (p, 3) in [0, 1] of each cell: (n,) float32.
 
     Cells (n, 3), in units of their side ``edge``, begin at origin + cells * edge.
     """
-    steps = (np.arange(per_axis) + 0.5) / per_axis * edge
-    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    offsets = points * edge
     best, some = np.empty(len(cells), np.float32), max(1, CHUNK // len(offsets))
     for at in range(0, len(cells), some):
         part = slice(at, at + some)

@@ -21,8 +21,8 @@ ENOUGH_VIEWS = 20
 another view alone."""
 SOLID = 0.2
 """Opacity from which a leaf of a given octree stays, whatever fewer views need."""
-JUDGING_VIEWS = 50
-"""Views that are asked, evenly chosen: of 100 views of an object the other half changed nothing."""
+JUDGING_VIEWS = 25
+"""Views that are asked, evenly chosen: of 100 views of an object the others changed nothing."""
 _BLOCK = 3  # levels above a leaf: the middle of so large a cell stands for its leaves, for pictures change slowly
 
 

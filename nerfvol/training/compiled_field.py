@@ -18,11 +18,13 @@ from nerfvol.errors import InputError
 from nerfvol.field.layout import Domain
 from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_model import CompiledField
-from nerfvol.kernels.field_ops import FieldBatch, FieldLoss, FieldRates, FieldState, March, Occupancy
+from nerfvol.kernels.field_ops import FieldBatch, FieldState, March, Occupancy
 from nerfvol.kernels.field_state import COARSE
 from nerfvol.native import native
 from nerfvol.neural import FieldModel
+from nerfvol.training import field_schedule
 from nerfvol.training.appearance import Appearance, small_picture
+from nerfvol.training.field_looks import look
 from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
 if TYPE_CHECKING:
@@ -31,33 +33,11 @@ if TYPE_CHECKING:
 
 MOST_RAYS = 32768
 """Of one step, while most of space is known to be empty."""
-COARSE_STEPS = ((32, 4), (128, 2))
-"""Until so many steps are done, steps along rays are so many times longer: all cells are occupied then."""
-COARSE_LEVELS = ((32, 4), (128, 6))
-"""Until so many steps are done, only so many levels of the grid are in use: haze of all space would move all entries of finer
-ones, and nothing is known that fine."""
-NEGLIGIBLE = 0.25
-"""Samples whose gradient is below this share of the mean one play Russian roulette: half of the samples have a fiftieth of the
-gradient, and the backward pass is half of a step."""
-SWEEPS = (32, 64, 128)
-"""After so many steps the whole region is looked at, one point a block of 2**3 cells ..."""
-THINNED = (160, 200, 240, 280, 320, 380, 440, 500, 600, 700, 850, 1000, 1300, 1600, 2000, 3000, 5000)
-THIN_DECAY = 0.5
-"""... after so many, every occupied cell, and what was seen of it before counts by this factor: haze of the first steps would
-stay occupied for thousands of steps, and be half of the samples; ..."""
-SETTLED = THINNED[6]
-"""After so many steps little haze is left."""
-PROBE_EVERY, PROBES = 64, 32768
-"""... and from the sweeps on, each so many steps, so many cells, half of them among the occupied ones."""
-SLOW_LEVELS, SLOW_EVERY = 3, 2
-"""Levels of the grid from this one on are moved at every second step, by the gradient of both: half the work of Adam."""
-NETWORK_DECAY = 1e-6
-EPS = 1e-6
-"""Of Adam: entries that only samples of no weight were in hardly move, which 1e-15 would send a full step at random."""
+FEW_WIDTH = 64
+"""Neurons of a layer, at least, where there are few training views: a wide network guesses better what none of them sees, with
+many views it only costs time."""
 SECONDS_TO_WRITE = 0.3
 """Of a field that is the product."""
-WARM_UP = 20
-"""Steps over which the rate rises."""
 
 
 def _key(seed: int, step: int) -> int:
@@ -124,6 +104,7 @@ class CompiledFieldTrainer:
     rates = "field.rate"
     previews = (0.6, 1.0)  # not of haze, which takes long
     preview_width = 400
+    timed_at = 8  # each ray costs alike
     stages_left = 0
     most_steps = math.inf
 
@@ -140,7 +121,9 @@ class CompiledFieldTrainer:
         self.final, self.appearance = final, Appearance(len(dataset), "off")
         self.dataset, self.seed, self.domain = dataset, seed, domain
         self.few = len(dataset) <= config.few_views
-        shape = dataclasses.replace(config.shape, sh_degree=0) if self.few else config.shape
+        shape = config.shape
+        if self.few:
+            shape = dataclasses.replace(shape, sh_degree=0, width=max(shape.width, FEW_WIDTH))
         self.config = dataclasses.replace(config, shape=shape)
         self.background = (float(background[0]), float(background[1]), float(background[2]))
         self.state = FieldState(domain, shape, seed)
@@ -166,9 +149,8 @@ class CompiledFieldTrainer:
         return seconds if self.final else min(self.config.time_budget, FIELD_SHARE * seconds)
 
     def size(self) -> str:
-        """See Phase: where it is the product, what a picture takes follows from the occupied cells, in powers of two; before
-        haze is gone it takes seconds, and tells nothing of the end."""
-        if not self.final or self.steps_done < SETTLED:
+        """See Phase: where it is the product, what a picture takes follows from the occupied cells, in powers of two."""
+        if not self.final:
             return f"{self.parameter_bytes // 4:,} parameters"
         cells = int(np.unpackbits(self.occupancy.coarse.view(np.uint8)).sum()) * COARSE**3
         return f"{self.parameter_bytes // 4:,} parameters, about {2 ** round(math.log2(max(1, cells))):,} cells"
@@ -194,9 +176,10 @@ class CompiledFieldTrainer:
         return self.trained_field().picture(camera)
 
     def trained_field(self) -> CompiledField:
-        """The field without what it holds in space that training skips: what is to be rendered or distilled."""
+        """The field without what it holds in space that training skips: what is to be rendered or distilled. Its steps along rays
+        are the finest, which show more than those that it has been trained with so far."""
         self.state.use_levels(self.state.n_levels)  # as it will be read from a file
-        return CompiledField(self.state, self.march, self.background)
+        return CompiledField(self.state, self.march.with_steps(self.config.march_steps[-1]), self.background)
 
     def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See FinalPhase."""
@@ -220,14 +203,15 @@ class CompiledFieldTrainer:
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         stage = config.stage_at(progress)
         batch = self._bank(config.downscales[stage]).sample(self.n_rays, self.seed, self.steps_done)
-        longer = next((factor for until, factor in COARSE_STEPS if self.steps_done < until), 1)
-        self.march = self.march.with_steps(max(8, config.march_steps[stage] // longer))
-        levels = next((n for until, n in COARSE_LEVELS if self.steps_done < until), self.state.n_levels)
-        self.state.use_levels(min(levels, self.state.n_levels))
-        moves = [level < SLOW_LEVELS or self.steps_done % SLOW_EVERY == 1 for level in range(self.state.n_levels)]
-        report = field_ops.train_step(self.state, batch, self.march, self._loss(progress), self._rates(progress), moves)
+        step, n_levels = self.steps_done, self.state.n_levels
+        self.march = self.march.with_steps(field_schedule.march_steps(config, stage, step))
+        self.state.use_levels(field_schedule.levels_in_use(n_levels, step))
+        loss = field_schedule.loss_at(config, self.few, self.background, progress)
+        rates = field_schedule.rates_at(config, self.few, step, progress)
+        moves = field_schedule.moves(n_levels, step)
+        report = field_ops.train_step(self.state, batch, self.march, loss, rates, moves)
         self.steps_done += 1
-        self._look()
+        look(self.state, self.occupancy, self.seed, self.steps_done)
         n_rays = self.n_rays
         self._follow_samples(report.samples / n_rays)
         return FieldReport(
@@ -235,55 +219,9 @@ class CompiledFieldTrainer:
             downscale=config.downscales[stage],
         )  # fmt: skip
 
-    def _loss(self, progress: float) -> FieldLoss:
-        config, fading = self.config, 0.1**progress
-        entropy = config.few_entropy if self.few else config.entropy_weight
-        colour, distortion = fading * config.colour_weight, fading * config.distortion_weight
-        return FieldLoss(self.background, colour, distortion, entropy, negligible=NEGLIGIBLE)
-
-    def _rates(self, progress: float) -> FieldRates:
-        config = self.config
-        warm = min(1.0, (self.steps_done + 1) / WARM_UP)
-        decay = config.rate_decay ** max(0.0, (progress - 1 / 3) * 1.5)
-        table_decay = config.few_decay if self.few else config.table_decay
-        return FieldRates(config.rate * warm * decay, eps=EPS, table_decay=table_decay, network_decay=NETWORK_DECAY)
-
-    def _look(self) -> None:
-        """Look at cells that samples may not have been in, so that empty ones are found and space can come back."""
-        grid, r = self.occupancy, self.occupancy.resolution
-        if self.steps_done in SWEEPS:
-            blocks = np.stack(np.unravel_index(np.arange(grid.cubes * (r // 2) ** 3), (grid.cubes, *[r // 2] * 3)), 1)
-            low = np.ravel_multi_index((blocks[:, 0], *(2 * blocks[:, 1:].T)), (grid.cubes, r, r, r))
-            grid.note_blocks(self._seen(low, 2))
-        elif self.steps_done in THINNED:
-            held = np.flatnonzero(grid.cells().reshape(-1))
-            grid.note(held, self._seen(held, 1), THIN_DECAY)
-        elif self.steps_done > SWEEPS[-1] and self.steps_done % PROBE_EVERY == 0:
-            rng = self._rng()
-            held = np.flatnonzero(grid.cells().reshape(-1))
-            anywhere = rng.integers(len(grid.sigmas), size=PROBES // 2)
-            cells = np.concatenate([anywhere, held[rng.integers(len(held), size=PROBES // 2)]])
-            grid.note(cells, self._seen(cells, 1))
-        else:
-            return
-        grid.refresh()
-        if grid.thickest() < 1 / (255 * math.sqrt(3) * r):  # a whole ray would not change an 8-bit colour
-            raise InputError(
-                "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
-                "the images' background and that the scene bounds contain the object, lower field.rate, or start with "
-                "--init direct"
-            )
-
-    def _rng(self) -> np.random.Generator:
-        return np.random.Generator(np.random.Philox(key=[self.seed, 1 + self.steps_done]))
-
-    def _seen(self, cells: np.ndarray, size: int) -> np.ndarray:
-        positions = self.occupancy.positions(cells, self._rng().random((len(cells), 3)), size)
-        return field_ops.evaluate(self.state, positions, values=False)[0]
-
     def _follow_samples(self, per_ray: float) -> None:
         """Choose the next number of rays so that a step has about ``samples_per_step`` samples."""
-        wanted = self.config.samples_per_step / max(per_ray, 0.25)
+        wanted = field_schedule.samples_wanted(self.config, self.steps_done) / max(per_ray, 0.25)
         self.n_rays = max(1, min(MOST_RAYS, int(min(wanted, 1.25 * self.n_rays + 16))))
 
     def _bank(self, downscale: int) -> Pixels:

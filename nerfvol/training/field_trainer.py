@@ -173,6 +173,7 @@ class FieldTrainer:
     rates = "field.rate"
     previews = (0.1, 0.4, 1.0)
     preview_width = 100  # a field renders slowly
+    timed_at = 8
     stages_left = 0
     most_steps = math.inf
 

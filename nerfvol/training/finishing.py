@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from nerfvol.cameras.camera import Camera
 from nerfvol.config.training import Config
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import ssim
@@ -45,12 +46,12 @@ def seconds_to_finish(config: Config, data: Data, scoring: float, phase: Phase |
         rendering = 0.1e-6 * data.first.images[0].size / 3
         writing = EXPECTED_SECONDS_TO_WRITE if config.representation == "octree" else SECONDS_TO_WRITE
     else:
-        rendering = _seconds(phase.picture, data.held_out.cameras[0])
+        rendering = seconds_of_picture(phase, data.held_out.cameras[0])
         writing = phase.seconds_to_write()
         if rows:
             camera = data.training.cameras[0]
             lens = camera.intrinsics
-            small = _seconds(phase.picture, camera.scaled(fitting_factor(lens.width, lens.height)))
+            small = seconds_of_picture(phase, camera.scaled(fitting_factor(lens.width, lens.height)))
     return min(
         writing
         + data.reading
@@ -58,6 +59,12 @@ def seconds_to_finish(config: Config, data: Data, scoring: float, phase: Phase |
         + 1.1 * len(data.held_out) * (scoring + rendering + FIT_SECONDS * config.refine_poses),
         RESERVE_SHARE * (config.time_budget or math.inf),
     )
+
+
+def seconds_of_picture(phase: Phase, camera: Camera) -> float:
+    """What a picture of the camera takes; see Phase.timed_at."""
+    k = min(phase.timed_at, camera.intrinsics.width, camera.intrinsics.height)
+    return k * k * _seconds(phase.picture, camera.scaled(k))
 
 
 def _seconds(function: Callable[..., object], *arguments: object) -> float:

@@ -79,6 +79,7 @@ class MediumTrainer:
     rates = "medium.rate"
     previews = (0.1, 0.4, 1.0)
     preview_width = 200
+    timed_at = 1
     most_steps = math.inf
 
     def __init__(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerfvol.config.training import OctreeConfig, SceneChoices
+from nerfvol.config.octree import OctreeConfig, SceneChoices
 from nerfvol.kernels import ops
 
 BACKGROUND_STREAM = 2

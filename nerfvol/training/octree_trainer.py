@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.config.training import OctreeConfig, SceneChoices, finest_level
+from nerfvol.config.octree import OctreeConfig, SceneChoices, finest_level
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.store import Corrected
 from nerfvol.datasets.tiles import Cursors, TileBank
@@ -61,6 +61,7 @@ class OctreeTrainer(GrowingOctree):
     rates = "octree.rate_density, octree.rate_dc and octree.rate_sh"
     previews = (0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
     preview_width = 200
+    timed_at = 1
 
     def __init__(
         self,

@@ -52,6 +52,12 @@ class Phase(Protocol):
         ...
 
     @property
+    def timed_at(self) -> int:
+        """Factor by which a picture is reduced where it is drawn to learn what a whole one takes: the factor's square times as
+        long. 1 where other things than pixels count."""
+        ...
+
+    @property
     def stages_left(self) -> int:
         """Stages after the present one."""
         ...

@@ -30,7 +30,7 @@ from nerfvol.models import Model
 from nerfvol.neural import FieldModel
 from nerfvol.training.clock import Clock, first_signal_noted
 from nerfvol.training.compiled_field import compiled_refusal
-from nerfvol.training.finishing import seconds_to_finish, seconds_to_score
+from nerfvol.training.finishing import seconds_of_picture, seconds_to_finish, seconds_to_score
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder
 from nerfvol.views import OctreeModel, SplatModel
@@ -235,10 +235,13 @@ class Run:
         """The first held-out view, small: truth next to what the phase has. A time budget is for training: what previews may
         take of it is bounded."""
         budget, started = self.config.time_budget, time.perf_counter()
-        if budget is not None and self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
-            return
         camera, image = self.data.first.cameras[0], self.data.first.images[0]
         k = max(1, -(-camera.intrinsics.width // phase.preview_width))
+        if budget is not None:
+            if phase.timed_at > 1:
+                self._preview_cost = seconds_of_picture(phase, camera.scaled(k))
+            if self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
+                return
         truth = np.divide(composite_average(image, self.background, k), 255, dtype=np.float32)
         picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
         path = self.folder / run_folder.PREVIEWS / f"{phase.name}_{round(100 * moment):03d}.png"

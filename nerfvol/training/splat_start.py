@@ -75,7 +75,7 @@ def _from_file(run: Run, path: str, degree: int, most: int) -> Splats:
 
     model, config = load_model(path), run.config
     if isinstance(model, OctreeModel):
-        seen = run.data.training.evenly(JUDGING_VIEWS)
+        seen = run.data.training.evenly(2 * JUDGING_VIEWS)
         weights = largest_weights(model.octree, seen, run.background, judged_downscale(seen))
         splats = surfels(model.octree, weights, most, config.splats.mode)
         run.say(f"start: {splats.n:,} discs on what is seen of the {model.octree.n_leaves:,} leaves of {path}")

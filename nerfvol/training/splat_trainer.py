@@ -50,6 +50,7 @@ class SplatTrainer:
     rates = "splats.rate_means, splats.rate_scales and splats.rate_logits"
     previews = (0.03, 0.1, 0.3, 0.6, 1.0)
     preview_width = 400
+    timed_at = 1
     most_steps = math.inf
 
     def __init__(

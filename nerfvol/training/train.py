@@ -25,7 +25,6 @@ from typing import TYPE_CHECKING, Any
 from nerfvol import __version__
 from nerfvol.config.octree import FINEST_LEVEL
 from nerfvol.config.training import Config
-from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
@@ -52,6 +51,7 @@ from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
 from nerfvol.training.refined import write_refined
 from nerfvol.training.saved import read_saved
+from nerfvol.training.scoring import affordable_scores
 from nerfvol.training.session import Run, Say, Watch
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import OctreeModel
@@ -69,7 +69,6 @@ WHY = {
 }
 MakeBar = Callable[[str, float], Any]
 """A phase's name and what is done of it, 0 to 1 -> a bar with tqdm's ``update`` and ``set_postfix_str``."""
-FEWEST_SCORED = 2
 MEASURED_FROM = 1.0
 """Seconds for each photograph from which on exposures are measured before training: that takes 0.02 to 0.08 s of each."""
 LOG_EVERY = 50
@@ -311,7 +310,7 @@ def finish(run: Run, trained: list[Model]) -> Results:
     return_free_memory()
     model = load_model(path)
     frame = run.data.frame
-    scores = evaluate(model, affordable_views(run, model, frame.dataset_back(run.data.held_out)), run.background)
+    scores = affordable_scores(run, model, frame.dataset_back(run.data.held_out))
     counts = _counts(model)
     row = {"seconds": seconds, "steps": run.steps[model.kind], "MB": written / 1e6, **counts}
     if run.results:
@@ -333,32 +332,6 @@ def finish(run: Run, trained: list[Model]) -> Results:
     few = run.data.compared.cameras[-1].intrinsics
     size = ", ".join(f"{count:,} {name}" for name, count in counts.items())
     return Results(run.folder, path, metrics, size, f"middle {few.width}x{few.height} of {len(run.data.compared)}")
-
-
-def affordable_views(run: Run, model: Model, held_out: Dataset) -> Dataset:
-    """The held-out views that can be scored in what a time budget leaves, FEWEST_SCORED at least; all where there is no budget.
-    Slow are the octrees of photographs that had seconds only: they are fog."""
-    budget = run.config.time_budget
-    if budget is None:
-        return held_out
-
-    def seconds_a_view() -> float:
-        started = time.perf_counter()
-        (row,) = evaluate(model, held_out.evenly(1), run.background)["rows"]
-        drawing, both = row["seconds"], time.perf_counter() - started
-        return drawing + (both - drawing) / ops.get_threads()  # so many views are scored side by side
-
-    def affordable(each: float) -> int:
-        return max(FEWEST_SCORED, int((budget - run.clock.elapsed()) / each))
-
-    n = affordable(each := seconds_a_view())
-    if FEWEST_SCORED < len(held_out) > n:  # the first one also made what all share: prefiltered nodes, the lens's rays
-        n = affordable(each := seconds_a_view())
-    if n >= len(held_out):
-        return held_out
-    run.say(f"a view takes {each:.1f} s to draw and score: {n} of the {len(held_out)} held-out views are scored, evenly "
-            "chosen, to keep near the time budget; nerfvol eval scores all")  # fmt: skip
-    return held_out.evenly(n)
 
 
 # ------------------------------------------------------------------ small things

@@ -38,6 +38,24 @@ def test_exactly_the_steps_in_occupied_cells(isa, domain, n_steps):
 
 
 @pytest.mark.parametrize("domain", DOMAINS)
+@pytest.mark.parametrize(
+    "low, high", [((8, 9, 20), (11, 13, 22)), ((0, 12, 28), (5, 14, 32)), ((3, 0, 0), (29, 32, 32))]
+)
+def test_a_box_around_what_is_occupied_leaves_nothing_out(isa, domain, low, high):
+    """Blocks of cells in the middle and at faces, which most rays miss: the same bits without coarse cells and box."""
+    march = fields.scattered(DOMAINS[domain], 48, share=0.001)
+    grid = march.occupancy
+    sigmas = grid.sigmas.reshape(grid.cubes, *[grid.resolution] * 3)
+    sigmas[...] = 0
+    sigmas[0, low[0] : high[0], low[1] : high[1], low[2] : high[2]] = 1e6
+    grid.refresh()
+    state, batch = fields.field(fields.HASHED, DOMAINS[domain]), fields.rays(4000, DOMAINS[domain], seed=5)
+    ours = field_ops.march_rays(state, batch, march)
+    assert np.array_equal(ours, field_ops.march_rays(state, batch, dataclasses.replace(march, coarse=False)))
+    assert ours.any()
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
 def test_bits_are_those_of_the_torch_grid(compiled, domain):
     """Cells above the threshold, summaries of smaller cubes in larger ones, and coarse cells dilated by one."""
     ours = fields.scattered(DOMAINS[domain], share=0.001)

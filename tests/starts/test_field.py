@@ -15,7 +15,7 @@ from nerfvol.field.layout import Domain
 from nerfvol.octree.rows import explin
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
-from nerfvol.starts.cells import Frame, candidate_cells, dilated, finer_cells, largest_sigma
+from nerfvol.starts.cells import EVERYWHERE, Frame, candidate_cells, dilated, finer_cells, largest_sigma
 from nerfvol.starts.field import distill
 from nerfvol.starts.values import REACH, WIDE_REACH, write_values
 from nerfvol.starts.visible import ENOUGH_VIEWS, judged_downscale, largest_weights, needed, views_of_leaves
@@ -252,7 +252,7 @@ def test_cells_are_searched_throughout() -> None:
                 return positions[:, axis] + 10
 
         np.testing.assert_allclose(
-            largest_sigma(Ramp(), cells, origin, 0.4, 4), corners[:, axis] + 10 + 0.35, rtol=1e-6
+            largest_sigma(Ramp(), cells, origin, 0.4, EVERYWHERE), corners[:, axis] + 10 + 0.35, rtol=1e-6
         )
 
 

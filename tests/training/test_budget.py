@@ -11,6 +11,7 @@ import pytest
 
 from nerfvol.cli.command import set_threads
 from nerfvol.config.field import FieldConfig
+from nerfvol.datasets.dataset import evenly
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
@@ -18,7 +19,7 @@ from nerfvol.training import clock, field_trainer, finishing, octree_end, prepar
 from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory import OctreePlan, gib, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
-from nerfvol.training.train import affordable_views
+from nerfvol.training.scoring import affordable_scores
 from tests.fixtures.runs import Pretended, log_of, run_of, settings, start
 
 
@@ -164,11 +165,12 @@ def test_the_most_steps_draw_each_tile_so_often(tmp_path, tiny_scene):
     assert most_steps(1.0) == most_steps(0.5) > 0  # however few the tiles
 
 
-@pytest.mark.parametrize("left, scored, timed", [(12, 3, 2), (17, 5, 2), (24, 5, 1), (-1, 2, 2)])
-def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, monkeypatch, left, scored, timed):
+@pytest.mark.parametrize("left, scored", [(9, 3), (11, 4), (12, 5), (24, 5), (-1, 2)])
+def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, monkeypatch, left, scored):
     """By a clock that only pictures put on: 2 seconds each, 4 the first one, which makes what all share (prefiltered nodes).
 
-    Of 12 seconds 6 are left after two timed pictures: three views of five. Of 17 it is 11, of 24 after one picture 20: all.
+    No view is drawn twice. Of 9 seconds 3 are left after the first and the last one: another of the five; of 24 after the first
+    20, enough for all.
     """
     said, pictures = [], []
     run = run_of(settings(tiny_scene, tmp_path, time_budget=100.0))
@@ -184,9 +186,10 @@ def test_slow_views_are_scored_as_the_budget_allows(tmp_path, tiny_scene, monkey
 
     monkeypatch.setattr(session.time, "perf_counter", seconds)
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: 100.0 - left + seconds())
-    views = affordable_views(run, SimpleNamespace(kind="octree", render=render), held_out)
-    assert (len(views), len(pictures)) == (scored, timed)
-    assert views.names[0] == held_out.names[0] and views.names[-1] == held_out.names[-1]
+    rows = affordable_scores(run, SimpleNamespace(kind="octree", render=render), held_out)["rows"]
+    assert len(rows) == len(pictures) == scored
+    names = [row["name"] for row in rows]
+    assert names == [held_out.names[i] for i in evenly(5, scored)]
     assert (scored < 5) == any(f"{scored} of the 5 held-out views are scored" in line for line in said)
 
 
@@ -204,6 +207,26 @@ def test_a_representation_that_grew_is_asked_anew(tmp_path, tiny_scene, monkeypa
     for now[0], size[0] in [(5, 0), (6, 1), (9, 1), (10, 1), (12, 2), (17, 2), (30, 2)]:
         run.keep_time(phase)
     assert asked == [9, 17]
+
+
+def test_a_field_tells_what_a_picture_takes_by_a_small_one(tmp_path, tiny_scene, monkeypatch):
+    """By a clock that goes on a millisecond a pixel: the time kept is that of whole pictures, and none was drawn."""
+    now, drawn = [0.0], []
+
+    def picture(camera):
+        drawn.append(camera.intrinsics.width * camera.intrinsics.height)
+        now[0] += 1e-3 * drawn[-1]
+
+    monkeypatch.setattr(session.time, "perf_counter", lambda: now[0])
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=1e4))
+    lens, views = run.data.held_out.cameras[0].intrinsics, len(run.data.held_out)
+    for timed_at in (1, 8):
+        phase = Pretended("field", timed_at=timed_at)
+        phase.picture = picture
+        drawn.clear()
+        kept = run._time_to_finish(phase)
+        assert drawn == [lens.width * lens.height // timed_at**2]
+        assert kept == pytest.approx(run.data.reading + 1.1e-3 * views * lens.width * lens.height, rel=1e-3)
 
 
 def test_previews_take_a_hundredth_of_a_budget_at_most(tmp_path, tiny_scene, monkeypatch):

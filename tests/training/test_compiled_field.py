@@ -13,7 +13,7 @@ from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.kernels.field_state import FieldState
 from nerfvol.starts.field import distill
-from nerfvol.training import compiled_field
+from nerfvol.training import field_looks, field_schedule
 from nerfvol.training.compiled_field import CompiledFieldTrainer, Pixels
 from nerfvol.training.field_start import make_field_trainer
 from nerfvol.training.field_trainer import FieldTrainer
@@ -64,9 +64,9 @@ def test_learns_the_ball(compiled, dataset: Dataset) -> None:
 def test_the_same_bits_with_any_number_of_threads_and_resumed(threads, dataset: Dataset, tmp_path: Path) -> None:
     """Across sweeps, a round of probes and a thinning, occupancy included; stopped through a checkpoint file."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled_field, "SWEEPS", (8, 16))
-        patch.setattr(compiled_field, "PROBE_EVERY", 8)
-        patch.setattr(compiled_field, "THINNED", (21,))
+        patch.setattr(field_looks, "SWEEPS", (8, 16))
+        patch.setattr(field_looks, "PROBE_EVERY", 8)
+        patch.setattr(field_looks, "THINNED", (21,))
         runs = []
         for n in (1, 2, 3):
             threads(n)
@@ -92,23 +92,63 @@ def test_haze_that_is_gone_does_not_stay_occupied(compiled, dataset: Dataset) ->
     grid.sigmas[:half], grid.sigmas[half:] = 100.0, 1e-3
     grid.refresh()
     assert grid.cells().reshape(-1)[:half].all() and not grid.cells().reshape(-1)[half:].any()
-    trainer.steps_done = compiled_field.THINNED[0] - 1
+    trainer.steps_done = field_looks.THINNED[0] - 1
     trainer.step()
     assert (grid.sigmas[:half] == 50.0).all() and (grid.sigmas[half:] == np.float32(1e-3)).all()
 
 
+def test_a_thinning_looks_at_no_more_cells_than_it_may(compiled, dataset: Dataset, monkeypatch) -> None:
+    """Of 32,768 occupied cells every seventh where 5,000 may be looked at: photographs have millions of hazy ones."""
+    monkeypatch.setattr(field_looks, "MOST_LOOKED", 5000)
+    trainer = trainer_of(dataset)
+    trainer.state.network[-13] = -8.0
+    grid = trainer.occupancy
+    grid.sigmas[...] = 100.0
+    grid.refresh()
+    field_looks.look(trainer.state, grid, 1, field_looks.THINNED[0])
+    looked = np.flatnonzero(grid.sigmas == 50.0)
+    assert len(looked) in (4681, 4682) and (np.diff(looked) == 7).all()
+    first = looked[0]
+    for step in field_looks.THINNED[1:9]:
+        grid.sigmas[...] = 100.0
+        field_looks.look(trainer.state, grid, 1, step)
+        if np.flatnonzero(grid.sigmas == 50.0)[0] != first:
+            return
+    pytest.fail("always the same cells")
+
+
+def test_steps_along_rays_become_finer(compiled, dataset: Dataset) -> None:
+    """Coarse first, as set in the end, and the same for a step whatever was before it."""
+    config = dataclasses.replace(SMALL, march_steps=(384,))
+    assert [field_schedule.march_steps(config, 0, step) for step in (0, 50, 300, 1000, 5000)] == [
+        64,
+        128,
+        192,
+        256,
+        384,
+    ]
+    assert field_schedule.march_steps(dataclasses.replace(SMALL, march_steps=(9,)), 0, 0) == 8
+    trainer = trainer_of(dataset)
+    trainer.steps_done = 5000
+    trainer.step()
+    assert trainer.march.n_steps == 64
+    trainer.steps_done = 0
+    trainer.step()
+    assert trainer.march.n_steps == 10 and trainer.trained_field().march.n_steps == 64
+
+
 def test_a_picture_is_drawn_anew_where_cells_change_and_not_where_rays_do(compiled, dataset: Dataset) -> None:
-    """A run asks ``size`` whether what scoring takes must be measured again; of haze a picture takes as long as many steps."""
+    """A run asks ``size`` whether what scoring takes must be measured again."""
     trainer = trainer_of(dataset)
     trainer.final = True
     asked = [(trainer.size(), trainer.n_rays) for _ in range(3) if trainer.step()]
     assert len({rays for _, rays in asked}) == 3 and len({size for size, _ in asked}) == 1
-    trainer.steps_done = compiled_field.SETTLED
-    hazy = trainer.size()
     trainer.occupancy.coarse[...] = 1  # one group of cells of 64
-    assert trainer.size() not in (hazy, asked[0][0])
+    assert trainer.size() != asked[0][0]
     trainer.final = False  # its octree will be scored
-    assert trainer.size() == asked[0][0]
+    hazy = trainer.size()
+    trainer.occupancy.coarse[...] = 255
+    assert trainer.size() == hazy
 
 
 def test_a_checkpoint_of_another_network_is_refused(compiled, dataset: Dataset) -> None:
@@ -124,7 +164,7 @@ def test_collapse_to_empty_space_is_reported(compiled, dataset: Dataset) -> None
     """A field that no picture could show: an error at the next look, not a silent empty result."""
     trainer = trainer_of(dataset)
     trainer.state.network[-13] = -30.0  # the raw density's bias, before those of 12 coefficients
-    trainer.steps_done = compiled_field.SWEEPS[0] - 1
+    trainer.steps_done = field_looks.SWEEPS[0] - 1
     with pytest.raises(InputError, match="collapsed to empty space"):
         trainer.step()
 
@@ -152,8 +192,20 @@ def test_rays_are_the_cameras_and_colours_the_images(compiled, dataset: Dataset)
 
 def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:
     trainer = trainer_of(dataset, dataclasses.replace(SMALL, few_views=8))
-    assert trainer.state.shape.sh_degree == 0 and trainer._rates(0.0).table_decay == SMALL.few_decay
-    assert trainer._loss(0.5).entropy == SMALL.few_entropy > trainer_of(dataset)._loss(0.5).entropy == 0
+    assert trainer.state.shape.sh_degree == 0 and trainer.state.shape.width == 64 > SMALL.shape.width
+    assert trainer.few and not trainer_of(dataset).few
+    config, schedule = trainer.config, field_schedule
+    assert (
+        schedule.rates_at(config, True, 0, 0.0).table_decay
+        == SMALL.few_decay
+        > schedule.rates_at(config, False, 0, 0.0).table_decay
+    )
+    assert (
+        schedule.loss_at(config, True, WHITE, 0.5).entropy
+        == SMALL.few_entropy
+        > schedule.loss_at(config, False, WHITE, 0.5).entropy
+        == 0
+    )
     assert trainer_of(dataset).state.shape.sh_degree == 1
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Camera, Intrinsics
-from nerfvol.config.training import OctreeConfig
+from nerfvol.config.octree import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.load import load_dataset
 from nerfvol.kernels import ops

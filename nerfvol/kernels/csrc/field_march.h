@@ -17,11 +17,12 @@ struct Marcher {
     const FieldMarch& m;
     Floats middle, group_middle, reach;   // of steps; of groups, and half their lengths in inner cubes
     std::vector<int32_t> least_cube;                  // whose coarse cells are long enough for a group
+    float low[3], high[3];                // a box around all occupied cells, units of the inner cube
 
     Marcher(const FieldShape& shape, const FieldMarch& march) : f(shape), m(march) {
         const int n = m.n_steps, groups = n / m.group;
         middle.resize(std::size_t(padded(n, 16)));
-        group_middle.resize(std::size_t(padded(groups, 16)));
+        group_middle.resize(std::size_t(padded(groups, 16) + kLanes));  // sixteen are read from any on
         reach.resize(group_middle.size());
         least_cube.resize(group_middle.size());
         for (int k = 0; k < n; ++k) middle[std::size_t(k)] = (m.edges[k] + m.edges[k + 1]) / 2;
@@ -31,6 +32,24 @@ struct Marcher {
             const float half_group = (upper - lower) / 2 / f.half;
             reach[std::size_t(g)] = half_group;
             least_cube[std::size_t(g)] = int32_t(std::ceil(std::log2(std::max(half_group * float(m.resolution / kCoarse) / 2, 1e-6f))));
+        }
+        find_box();
+    }
+
+    // Coarse cells reach a whole one beyond what is occupied: rounding cannot matter but at the faces, which bound nothing.
+    void find_box() {
+        for (int axis = 0; axis < 3; ++axis) low[axis] = -INFINITY, high[axis] = INFINITY;
+        if (m.cubes > 1) return;
+        const int c = m.resolution / kCoarse;
+        int least[3] = {c, c, c}, most[3] = {-1, -1, -1};
+        for (int w = 0; w < (c * c * c + 63) / 64; ++w)
+            for (uint64_t bits = m.coarse[w]; bits; bits &= bits - 1) {
+                const int i = 64 * w + __builtin_ctzll(bits), at[3] = {i / (c * c), i / c % c, i % c};
+                for (int axis = 0; axis < 3; ++axis) least[axis] = std::min(least[axis], at[axis]), most[axis] = std::max(most[axis], at[axis]);
+            }
+        for (int axis = 0; axis < 3; ++axis) {
+            if (least[axis] > 0) low[axis] = float(least[axis]) * 2 / float(c) - 1;
+            if (most[axis] < c - 1) high[axis] = float(most[axis] + 1) * 2 / float(c) - 1;
         }
     }
 
@@ -91,21 +110,27 @@ struct Marcher {
     // One bit a step into `bits` (words()); `start` is where step 0 begins, also returned. o, d: units of the inner cube.
     float march(const float* o, const float* d, float jitter, uint64_t* bits) const {
         std::fill(bits, bits + words(), 0);
-        float near = 0.0f, far = INFINITY;
+        float near = 0.0f, far = INFINITY, enter = 0.0f, leave = INFINITY;
         for (int axis = 0; axis < 3; ++axis) {
-            const float tiny = 1.2e-32f, dir = std::fabs(d[axis]) < tiny ? tiny : d[axis];
+            const float tiny = 1.2e-32f, dir = std::fabs(d[axis]) < tiny ? tiny : d[axis], inverse = 1 / dir;
             const float a = (-f.outer - o[axis]) / dir, b = (f.outer - o[axis]) / dir;
             near = std::max(near, std::min(a, b));
             far = std::min(far, std::max(a, b));
+            const float c = (low[axis] - o[axis]) * inverse, e = (high[axis] - o[axis]) * inverse;
+            enter = std::max(enter, std::min(c, e));
+            leave = std::min(leave, std::max(c, e));
         }
         near = std::max(near, m.near_plane);
         const float start = near + (jitter - 0.5f) * m.step;
-        if (!(near < far)) return start;
+        if (!(near < far && enter < leave)) return start;
         const int windows = (m.n_steps + 15) / 16, per_window = 16 / m.group, groups = m.n_steps / m.group;
         alignas(64) float t[kLanes];
         alignas(64) uint32_t cell[kLanes];
-        for (int first = 0; first < groups; first += kLanes) {
-            if (start + m.edges[first * m.group] >= far) break;
+        const float until = std::min(far, leave);
+        int first = 0;
+        while (first + per_window < groups && start + m.edges[(first + per_window) * m.group] < enter) first += per_window;
+        for (; first < groups; first += kLanes) {
+            if (start + m.edges[first * m.group] >= until) break;
             for (int k = 0; k < kLanes; ++k) t[k] = start + group_middle[std::size_t(first + k)];
             cells(o, d, t, reach.data() + first, least_cube.data() + first, m.resolution / kCoarse, cell);
             const uint32_t hits = bits_at(m.coarse, cell);
