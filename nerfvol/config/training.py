@@ -375,7 +375,7 @@ class SceneChoices:
 
 
 OCTREE_STARTS = ("direct", "mlp")
-SPLAT_STARTS = ("points", "sweep", "points+sweep", "random")
+SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
 
 
