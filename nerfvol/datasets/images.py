@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from nerfvol.cameras.warp import reduce
+from nerfvol.datasets.shared_pixels import pixels_of
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
 from nerfvol.files.unchanged import while_unchanged
@@ -230,7 +231,7 @@ def _pixels(image: Image.Image, path: Path) -> UInt8:
         raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32-bit pixels (mode {image.mode})")
     has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
     wanted = "RGBA" if has_alpha else "RGB"
-    return np.asarray(image if image.mode == wanted else image.convert(wanted))
+    return pixels_of(image if image.mode == wanted else image.convert(wanted))
 
 
 def _area_sums(plane: NDArray[np.unsignedinteger], k: int) -> NDArray[np.uint32]:
