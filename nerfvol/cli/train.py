@@ -33,7 +33,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--init", metavar="START", help="where it starts. octree: direct (low density everywhere) or mlp (a small "
                    "field, trained first and distilled, which auto takes for objects of few views); splats: points (of a "
                    "COLMAP model), sweep (of planes through the photographs), points+sweep, "
-                   "random, or a file of splats or an octree (default: auto)")  # fmt: skip
+                   "hull (of the silhouettes of a cut-out object), random, or a file of splats or an "
+                   "octree (default: auto)")  # fmt: skip
     p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "
                    "a fixed number of steps, the same result every time (default: none)")  # fmt: skip
     p.add_argument("--background", metavar="COLOUR", help="white, black or R,G,B from 0 to 1: what images with alpha "

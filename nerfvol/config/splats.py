@@ -25,10 +25,10 @@ class SplatConfig(Checked):
     """Spherical harmonics of the colours: 0 to 3. None: 1 in photographs, 2 for objects."""
     mode: Literal["mip", "plain"] = "mip"
     """How what is smaller than a pixel is drawn: "mip" holds its light at every size, "plain" is for viewers that cannot."""
-    rate_means: Rate = 0.2
-    """Adam's rate of the means, in units of a Gaussian's own size."""
-    rate_scales: Rate = 0.12
-    """... of the logarithms of the scales,"""
+    rate_means: Rate | None = None
+    """Adam's rate of the means, in units of a Gaussian's own size. None: 0.2 in photographs, 0.25 for objects."""
+    rate_scales: Rate | None = None
+    """... of the logarithms of the scales (None: 0.12 and 0.18),"""
     rate_quats: Rate = 0.02
     """... of the rotations, as unit quaternions,"""
     rate_logits: Rate = 0.08
@@ -41,8 +41,9 @@ class SplatConfig(Checked):
     """Rates shrink to this factor over the run. None: 0.2 in photographs, 0.15 for objects."""
     rate_decay_means: Decay | None = None
     """... those of the means to this. None: 0.1 and 0.06."""
-    beta2: Annotated[float, within(0.5, 0.99999)] = 0.98
-    """Memory, per step, of Adam's second moments; short, for a run on a CPU has thousands of steps, not tens of thousands."""
+    beta2: Annotated[float, within(0.5, 0.99999)] | None = None
+    """Memory, per step, of Adam's second moments; short, for a run on a CPU has thousands of steps, not tens of thousands.
+    None: 0.98 in photographs, 0.96 for objects."""
     ssim: Weight | None = None
     """Weight of 1 - SSIM of 4x4 blocks next to the mean squared error. None: 0.03 in photographs, 0.02 for objects."""
     scale: Weight = 0.0
@@ -61,6 +62,12 @@ class SplatConfig(Checked):
         return filled(self, PHOTOGRAPHS if scene.is_unbounded else OBJECTS)
 
 
-PHOTOGRAPHS: dict[str, Any] = {"sh_degree": 1, "rate_decay": 0.2, "rate_decay_means": 0.1, "ssim": 0.03}
-OBJECTS: dict[str, Any] = {"sh_degree": 2, "rate_decay": 0.15, "rate_decay_means": 0.06, "ssim": 0.02}
+PHOTOGRAPHS: dict[str, Any] = {
+    "sh_degree": 1, "rate_means": 0.2, "rate_scales": 0.12, "rate_decay": 0.2, "rate_decay_means": 0.1, "beta2": 0.98,
+    "ssim": 0.03,
+}  # fmt: skip
+OBJECTS: dict[str, Any] = {
+    "sh_degree": 2, "rate_means": 0.25, "rate_scales": 0.18, "rate_decay": 0.15, "rate_decay_means": 0.06, "beta2": 0.96,
+    "ssim": 0.02,
+}  # fmt: skip
 """Settings of splats where nothing else is said."""

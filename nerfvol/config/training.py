@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
 OCTREE_STARTS = ("direct", "mlp")
-SPLAT_STARTS = ("points", "sweep", "points+sweep", "random")
+SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
 
 

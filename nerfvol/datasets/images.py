@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 
 from nerfvol.cameras.warp import reduce
 from nerfvol.datasets.colours import Colours, colours_of, eight_bits
+from nerfvol.datasets.shared_pixels import pixels_of
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import explain_os_error
 from nerfvol.files.unchanged import while_unchanged
@@ -247,7 +248,7 @@ def _pixels(image: Image.Image, path: Path) -> UInt8:
         return np.repeat(eight_bits(image)[..., None], 3, axis=2)
     has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info
     wanted = "RGBA" if has_alpha else "RGB"
-    return np.asarray(image if image.mode == wanted else image.convert(wanted))
+    return pixels_of(image if image.mode == wanted else image.convert(wanted))
 
 
 def _area_sums(plane: NDArray[np.unsignedinteger], k: int) -> NDArray[np.uint32]:

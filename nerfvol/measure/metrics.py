@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.native import native
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -54,24 +55,35 @@ def ssim(image: Tensor | ArrayLike, reference: Tensor | ArrayLike, seen: NDArray
     a, b = _pair(image, reference)
     if a.ndim != 3 or min(a.shape[:2]) < WINDOW:
         raise InputError(f"SSIM needs images (height, width, channels) of at least 11x11 pixels, got shape {a.shape}")
-    height, width, channels = a.shape
-    inner = height - WINDOW + 1
-    if seen is not None:
-        return _ssim_where(np.where(seen[..., None], a, b), b, seen)
-    total = 0.0
-    for channel in range(channels):
-        for top in range(0, inner, _BAND):
-            rows = slice(top, min(top + _BAND, inner) + WINDOW - 1)
-            total += float(np.sum(_similarity(a[rows, :, channel], b[rows, :, channel]), dtype=np.float64))
-    return total / (channels * inner * (width - WINDOW + 1))
-
-
-def _ssim_where(a: Floats, b: Floats, seen: NDArray[np.bool_]) -> float:
-    """The mean similarity of a and b (h, w, channels) over the windows whose middle is ``seen`` (h, w)."""
+    if seen is None:
+        return float(np.mean(_similarities(a, b), dtype=np.float64))
     half = WINDOW // 2
     middle = seen[half : seen.shape[0] - half, half : seen.shape[1] - half]
-    maps = np.stack([_similarity(a[..., channel], b[..., channel]) for channel in range(a.shape[2])], axis=-1)
+    maps = _similarities(np.where(seen[..., None], a, b), b)
     return float(np.mean(maps[middle] if middle.any() else maps, dtype=np.float64))
+
+
+def _similarities(a: Floats, b: Floats) -> Floats:
+    """The similarity at every position of the window inside images (h, w, channels): (h - 10, w - 10, channels)."""
+    height, width, channels = a.shape
+    out = np.empty((height - WINDOW + 1, width - WINDOW + 1, channels), a.dtype)
+    compiled = native()
+    if compiled is not None and a.dtype == np.float32:
+        first, second = np.ascontiguousarray(a), np.ascontiguousarray(b)
+        compiled.similarity(first, second, _window().astype(np.float32), _K1**2, _K2**2, out)
+        return out
+    for channel in range(channels):
+        for top in range(0, len(out), _BAND):
+            rows = slice(top, min(top + _BAND, len(out)) + WINDOW - 1)
+            out[top : top + _BAND, :, channel] = _similarity(a[rows, :, channel], b[rows, :, channel])
+    return out
+
+
+def _window() -> NDArray[np.float64]:
+    """(WINDOW,) weights along one axis; they sum to 1."""
+    offsets = np.arange(WINDOW) - WINDOW // 2
+    weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
+    return weights / weights.sum()
 
 
 def _similarity(a: Floats, b: Floats) -> Floats:
@@ -94,9 +106,7 @@ def _similarity(a: Floats, b: Floats) -> Floats:
 
 def _window_means(maps: Floats) -> Floats:
     """Gaussian-weighted means (n, h - 10, w - 10) of maps (n, h, w): down the columns, then along the rows."""
-    offsets = np.arange(WINDOW) - WINDOW // 2
-    weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
-    weights = (weights / weights.sum()).astype(maps.dtype)
+    weights = _window().astype(maps.dtype)
     for axis in (1, 2):
         size = maps.shape[axis] - WINDOW + 1
         part = [maps[:, j : j + size] if axis == 1 else maps[:, :, j : j + size] for j in range(WINDOW)]

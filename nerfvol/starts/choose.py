@@ -11,6 +11,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.splats.points import PointCloud
+from nerfvol.starts.hull import has_silhouettes, hull_points
 from nerfvol.starts.model_points import has_points, model_points
 from nerfvol.starts.plane_sweep import SweepView, plane_sweep, sweep_factor
 from nerfvol.starts.random import random_points
@@ -35,9 +36,10 @@ class Start:
 def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = None, seed: int = 0) -> Start:
     """The points that splats of this dataset begin from.
 
-    Objects before nothing or a plain backdrop begin from random points in their box; photographs from the points of their
-    COLMAP model, else from a plane sweep; a model of fewer than 10,000 points gets the sweep's as well. Where a sweep finds
-    nothing, what there is of a model, or random points, are used. ``name``: "points", "sweep", "points+sweep" or "random".
+    Objects whose pictures are cut out begin from the hull of their silhouettes, others from random points in their box;
+    photographs from the points of their COLMAP model, else from a plane sweep; a model of fewer than 10,000 points gets the
+    sweep's as well. Where nothing is found, what there is of a model, or random points, are used. ``name``: one of
+    :data:`STARTS`.
 
     Raises:
         InputError: an unknown name, or what is asked for by name finds nothing.
@@ -57,6 +59,8 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
 
 def _suited(dataset: Dataset) -> tuple[str, str]:
     """The row that suits a dataset and why."""
+    if has_silhouettes(dataset):
+        return "hull", "an object whose pictures are cut out"
     if not dataset.scene.is_unbounded:
         return "random", "an object without surroundings is seen whole"
     if not has_points(dataset):
@@ -99,6 +103,15 @@ def _both(dataset: Dataset, photographs: Photographs, subject: Subject, seed: in
     return PointCloud.joined(a, b), f"{first}, and {second}"
 
 
+def _hull(dataset: Dataset, photographs: Photographs, subject: Subject, seed: int) -> _Found:
+    if not has_silhouettes(dataset):
+        return PointCloud.empty(), "its pictures have no silhouettes: they are not cut out"
+    cloud = hull_points(dataset, seed=seed)
+    if not len(cloud):
+        return cloud, "the silhouettes of its pictures have nothing in common"
+    return cloud, f"{len(cloud):,} points on the hull of the silhouettes"
+
+
 def _random(dataset: Dataset, photographs: Photographs, subject: Subject, seed: int) -> _Found:
     cloud = random_points(dataset.scene, seed=seed)
     return cloud, f"{len(cloud)} random points in the scene's box"
@@ -108,5 +121,6 @@ STARTS: dict[str, Callable[[Dataset, Photographs, Subject, int], _Found]] = {
     "points": _points,
     "sweep": _sweep,
     "points+sweep": _both,
+    "hull": _hull,
     "random": _random,
 }

@@ -18,16 +18,21 @@ COARSEST_SIDE = 100
 PIXELS_PER_SPLAT = 8
 """Of all training images together: more Gaussians than that have nothing to learn from."""
 
-_SECONDS = (8.0, 15.0, 30.0, 60.0, 120.0, 270.0, 600.0, 1800.0)
+_SECONDS = (3.0, 5.0, 8.0, 15.0, 30.0, 60.0, 120.0, 270.0, 600.0, 1800.0)
 _ENDS = {  # share of progress at which 1/8, 1/4 and 1/2 of the size end
-    8: (0.10, 0.08, 0.06, 0.04, 0.02, 0.015, 0.008, 0.004),
-    4: (0.40, 0.35, 0.25, 0.20, 0.12, 0.07, 0.04, 0.02),
-    2: (0.85, 0.80, 0.70, 0.60, 0.45, 0.33, 0.25, 0.20),
+    8: (0.10, 0.10, 0.10, 0.08, 0.06, 0.04, 0.02, 0.015, 0.008, 0.004),
+    4: (0.40, 0.40, 0.40, 0.35, 0.25, 0.20, 0.12, 0.07, 0.04, 0.02),
+    2: (0.85, 0.85, 0.85, 0.80, 0.70, 0.60, 0.45, 0.33, 0.25, 0.20),
 }
 _STEPS = {True: {8: 600, 4: 2000, 2: 4000}, False: {8: 300, 4: 500, 2: 1500}}  # of photographs and objects, in 30 s
-_GROWN = (0.40, 0.40, 0.35, 0.30, 0.25, 0.20, 0.20, 0.15)
-_PHOTOGRAPHS = (25e3, 35e3, 50e3, 80e3, 130e3, 180e3, 220e3, 300e3)
-_OBJECTS = (35e3, 50e3, 75e3, 105e3, 155e3, 172e3, 200e3, 250e3)
+_GROWN = {
+    True: (0.40, 0.40, 0.40, 0.40, 0.35, 0.30, 0.25, 0.20, 0.20, 0.15),
+    False: (0.60, 0.60, 0.60, 0.60, 0.45, 0.30, 0.25, 0.20, 0.20, 0.15),
+}
+_MOST = {
+    True: (25e3, 25e3, 25e3, 35e3, 50e3, 80e3, 130e3, 180e3, 220e3, 300e3),
+    False: (14e3, 20e3, 28e3, 48e3, 75e3, 105e3, 155e3, 172e3, 200e3, 250e3),
+}
 
 
 @dataclass(frozen=True)
@@ -88,9 +93,9 @@ def make_schedule(
         end = _at(_ENDS[min(factor, 8)], seconds)
         ends.append(end * (8 / factor) ** 2 if factor > 8 else end)
     pixels = sum(width * height for width, height in sizes)
-    affordable = int(_at(_PHOTOGRAPHS if photographs else _OBJECTS, seconds))
+    affordable = int(_at(_MOST[photographs], seconds))
     wanted = most if most is not None else min(affordable, max(1000, pixels // PIXELS_PER_SPLAT))
-    return Schedule(factors, (*ends, 1.0), wanted, _at(_GROWN, seconds), tuple(steps))
+    return Schedule(factors, (*ends, 1.0), wanted, _at(_GROWN[photographs], seconds), tuple(steps))
 
 
 def saved_schedule(state: Mapping[str, Any]) -> Schedule:

@@ -20,8 +20,8 @@ from nerfvol.starts.visible import JUDGING_VIEWS, judged_downscale, largest_weig
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule, saved_schedule
 
-OBJECT_OPACITY = 0.3
-"""Random points are mostly nowhere: they begin fainter than points that were found."""
+OPACITIES = {"random": 0.3, "hull": 0.8}
+"""Random points are mostly nowhere: they begin fainter than points that were found (0.5); what silhouettes leave is opaque."""
 
 
 def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
@@ -60,7 +60,7 @@ def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats,
         return _from_file(run, config.init, degree, most), subject_of(dataset).distance
     start = choose_start(dataset, photographs, None if config.init == "auto" else config.init, config.seed)
     run.say(start.sentence)
-    opacity = OBJECT_OPACITY if start.name == "random" else 0.5
+    opacity = OPACITIES.get(start.name, 0.5)
     distance, cloud = start.subject.distance, start.cloud
     if len(cloud) > most:
         cloud = cloud[np.sort(np.random.default_rng(config.seed).permutation(len(cloud))[:most])]

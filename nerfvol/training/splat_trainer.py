@@ -212,6 +212,9 @@ class SplatTrainer:
 
     def _rates(self, progress: float) -> SplatRates:
         c = self.config
+        assert (
+            c.rate_means is not None and c.rate_scales is not None and c.beta2 is not None
+        )  # see SplatConfig.for_scene
         fade = (c.rate_decay or 1.0) ** progress
         return SplatRates(
             means=c.rate_means * (c.rate_decay_means or 1.0) ** progress, log_scales=c.rate_scales * fade,

@@ -81,3 +81,16 @@ def test_what_cannot_be_compared_is_refused():
         ssim(a[:10], b[:10])
     with pytest.raises(InputError, match="some pixels"):
         psnr(a[:0], b[:0])
+
+
+@pytest.mark.parametrize("kind", ["noise", "flat", "unrelated"])
+def test_compiled_and_plain_ssim_are_the_same(kind, monkeypatch):
+    from nerfvol.measure import metrics
+
+    a, b = (x.astype(np.float32) for x in pictures(kind))
+    a = a[:, ::-1]  # a view that is not contiguous
+    seen = np.zeros(a.shape[:2], bool)
+    seen[20:50, 30:33] = True
+    compiled = ssim(a, b), ssim(a, b, seen)
+    monkeypatch.setattr(metrics, "native", lambda: None)
+    np.testing.assert_allclose(compiled, (ssim(a, b), ssim(a, b, seen)), atol=1e-5)

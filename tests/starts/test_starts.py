@@ -187,17 +187,17 @@ def test_damaged_points_of_a_model(tmp_path):
 
 
 # ------------------------------------------------------------------ the choice
-def photographs_of(n=6, alpha=False):
+def photographs_of(n=6, bounded=False):
     cameras = ring(n)
-    images = [np.full((30, 40, 4 if alpha else 3), 128, np.uint8) for _ in cameras]
+    images = [np.full((30, 40, 3), 128, np.uint8) for _ in cameras]
     box = np.array([[-1.0] * 3, [1.0] * 3])
-    scene = SceneBounds(box, None if alpha else 16 * box, alpha)
+    scene = SceneBounds(box, None if bounded else 16 * box, False)
     data = Dataset(cameras, images, [str(i) for i in range(n)], scene, "transforms.json")
     return data, Photographs(data)
 
 
 def test_objects_begin_at_random_and_grey_photographs_fall_back():
-    start = choose_start(*photographs_of(alpha=True))
+    start = choose_start(*photographs_of(bounded=True))
     assert start.name == "random" and len(start.cloud) == 3000 and "seen whole" in start.sentence
     start = choose_start(*photographs_of())
     assert start.name == "random" and len(start.cloud) and "too little texture" in start.sentence
@@ -205,7 +205,7 @@ def test_objects_begin_at_random_and_grey_photographs_fall_back():
         choose_start(*photographs_of(), name="sweep")
     with pytest.raises(InputError, match="'points' cannot be used: transforms.json"):
         choose_start(*photographs_of(), name="points")
-    with pytest.raises(InputError, match="one of points, sweep, points.sweep, random, got 'fog'"):
+    with pytest.raises(InputError, match="one of points, sweep, points.sweep, hull, random, got 'fog'"):
         choose_start(*photographs_of(), name="fog")
 
 

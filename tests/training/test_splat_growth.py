@@ -217,7 +217,8 @@ def test_rates_fade_and_the_loss_knows_the_scene(monkeypatch):
         return splat_ops.SplatReport(0.0, 0.25, 1, 1, 8)
 
     monkeypatch.setattr(splat_ops, "train_step", record)
-    trainer = trainer_of(around(5), shell(around(5), 4), rate_decay=0.2, rate_decay_means=0.05, ssim=0.7, scale=6.0)
+    trainer = trainer_of(around(5), shell(around(5), 4), rate_means=0.3, rate_scales=0.11, beta2=0.97,
+                         rate_decay=0.2, rate_decay_means=0.05, ssim=0.7, scale=6.0)  # fmt: skip
     for progress in (0.0, 0.5, 1.0):
         report = trainer.step(progress)
     assert report.squared_error == 0.25 and report.samples == 16 * 8 / 32**2

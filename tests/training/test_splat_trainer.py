@@ -345,8 +345,7 @@ def test_a_start_from_a_file(tmp_path, whole):
         start(splat_settings(whole.scene, tmp_path / "few", init=str(path), splats={"steps": 1, "max_splats": 50}))
     with pytest.MonkeyPatch.context() as patch:  # more than the seconds would pay for: all are kept
         patch.setattr(splat_schedule, "PIXELS_PER_SPLAT", 10**9)
-        patch.setattr(splat_schedule, "_PHOTOGRAPHS", (60.0,) * 8)
-        patch.setattr(splat_schedule, "_OBJECTS", (60.0,) * 8)
+        patch.setattr(splat_schedule, "_MOST", {True: (60.0,) * 10, False: (60.0,) * 10})
         start(splat_settings(whole.scene, tmp_path / "all", init=str(path), splats={"steps": 1}))
     assert metrics_of(tmp_path / "all")["splats"] == before["splats"]
 

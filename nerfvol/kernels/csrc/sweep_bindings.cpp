@@ -7,6 +7,7 @@
 
 #include "arrays.h"
 #include "neighbours.h"
+#include "similarity.h"
 #include "sweep.h"
 #include "warp.h"
 
@@ -100,6 +101,19 @@ void py_nearest(In<double, nb::shape<-1, 3>> points, std::optional<In<double, nb
             squared.data(), index.data());
 }
 
+void py_similarity(In<float, nb::ndim<3>> a, In<float, nb::ndim<3>> b, In<float, nb::ndim<1>> weights, float c1, float c2,
+                   Out<float, nb::ndim<3>> out) {
+    const size_t taps = weights.shape(0);
+    require(taps > 0 && a.shape(0) >= taps && a.shape(1) >= taps, "the window is larger than the picture");
+    for (size_t k = 0; k < 3; ++k) {
+        const size_t inner = k < 2 ? a.shape(k) - taps + 1 : a.shape(k);
+        require(a.shape(k) == b.shape(k) && out.shape(k) == inner, "the pictures and the output do not fit one another");
+    }
+    nb::gil_scoped_release release;
+    similarity(a.data(), b.data(), int64_t(a.shape(0)), int64_t(a.shape(1)), int64_t(a.shape(2)), weights.data(), int(taps), c1, c2,
+               out.data());
+}
+
 }  // namespace
 
 void bind_photographs(nb::module_& m) {
@@ -108,5 +122,6 @@ void bind_photographs(nb::module_& m) {
     m.def("remap", &py_remap, "source"_a, "grid"_a, "step"_a, "used_height"_a, "used_width"_a, "out"_a);
     m.def("reduce", &py_reduce, "source"_a, "factor"_a, "out"_a);
     m.def("sample", &py_sample, "picture"_a, "positions"_a, "cubic"_a, "out"_a);
+    m.def("similarity", &py_similarity, "a"_a, "b"_a, "weights"_a, "c1"_a, "c2"_a, "out"_a);
     m.def("nearest", &py_nearest, "points"_a, "queries"_a.none(), "squared"_a, "index"_a);
 }
