@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from data_synth.bricks import Sparse, cut_to
+from data_synth.bricks import SIDE, Sparse, cut_to
 from data_synth.errors import InputError
-from data_synth.jit import jit
+from data_synth.jit import inlined, jit
 from data_synth.sggx import matrices
 from data_synth.vec import trilinear
 
@@ -105,33 +105,36 @@ def _largest_area(part: np.ndarray) -> float:
     )
 
 
-@jit
-def cell_at(m, p):
-    """(first, u, v, w): the stored sample at the lower corner of the cell around p, -1 where no brick is, and where p is in
-    it."""
+@inlined
+def cell_of(m, p):
+    """(first, u, v, w): the stored sample at the lower corner of the cell around p, negative where no brick is, and where p is
+    in it. p: in cells from the lowest corner of the box."""
     n = m.cells
-    u = (p[0] - m.lo[0]) / m.cell[0]
-    v = (p[1] - m.lo[1]) / m.cell[1]
-    w = (p[2] - m.lo[2]) / m.cell[2]
-    i = min(max(int(u), 0), n[0] - 1)
-    j = min(max(int(v), 0), n[1] - 1)
-    k = min(max(int(w), 0), n[2] - 1)
-    first = m.offsets[((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3)]
-    if first >= 0:
-        first += ((i & 7) * 9 + (j & 7)) * 9 + (k & 7)
-    return first, u - i, v - j, w - k
+    i = min(max(int(p[0]), 0), n[0] - 1)
+    j = min(max(int(p[1]), 0), n[1] - 1)
+    k = min(max(int(p[2]), 0), n[2] - 1)
+    # unsigned, because an index that may be negative is checked each time
+    first = m.offsets[np.uintp(((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3))]
+    first += ((i & 7) * SIDE + (j & 7)) * SIDE + (k & 7) if first >= 0 else 0
+    return first, p[0] - i, p[1] - j, p[2] - k
 
 
-@jit
+@inlined
+def cell_at(m, p):
+    """``cell_of`` a point of the scene."""
+    return cell_of(m, ((p[0] - m.lo[0]) / m.cell[0], (p[1] - m.lo[1]) / m.cell[1], (p[2] - m.lo[2]) / m.cell[2]))
+
+
+@inlined
 def mixed(values, width, column, where):
     """Column ``column`` of ``width`` at a place in a cell (``cell_at``), 0 where no brick is."""
     first, u, v, w = where
     if first < 0:
         return 0.0
-    a = first * width + column
-    b, c = a + 81 * width, 9 * width
-    near = (values[a], values[a + width], values[a + c], values[a + c + width])
-    far = (values[b], values[b + width], values[b + c], values[b + c + width])
+    a, z, y = np.uintp(first * width + column), np.uintp(width), np.uintp(SIDE * width)
+    b = a + np.uintp(SIDE * SIDE * width)
+    near = (values[a], values[a + z], values[a + y], values[a + y + z])
+    far = (values[b], values[b + z], values[b + y], values[b + y + z])
     return trilinear(near + far, u, v, w)  # noqa: RUF005
 
 

@@ -22,11 +22,11 @@ import numpy as np
 from data_synth import media, sweep
 from data_synth import phase as phases
 from data_synth.cameras import picture_rows
-from data_synth.fields import at_sample
+from data_synth.fields import at_sample, cell_of
 from data_synth.jit import in_bands, in_parallel, jit, kernel
 from data_synth.lights import DIRECTIONAL, column3
 from data_synth.lookups import box_interval, lookup
-from data_synth.media import BRICK, GRID, Medium, triple
+from data_synth.media import BRICK, GRID, SIDE, Medium, triple
 from data_synth.rng import new_rng
 from data_synth.traverse import steps, traversal
 from data_synth.vec import add, along, mul, sub, unit
@@ -34,7 +34,6 @@ from data_synth.volumes import is_large
 from data_synth.world import SURFACES, World, has_boundaries, has_surfaces, visible
 
 OPAQUE = 1e-4  # a ray whose transmittance falls below this stops: at most this fraction of the radiance is lost
-SIDE = BRICK + 1
 SAMPLES = SIDE**3  # of a brick
 NEAR = 4.0  # cells: an eye nearer to the medium sees wo turn from sample to sample
 
@@ -164,18 +163,6 @@ def mix(f, a, b):
 
 
 @jit
-def place(m, p):
-    """(first sample, three fractions) of the cell around a point of a stored brick, given in cells."""
-    n = m.cells
-    i = min(max(int(p[0]), 0), n[0] - 1)
-    j = min(max(int(p[1]), 0), n[1] - 1)
-    k = min(max(int(p[2]), 0), n[2] - 1)
-    first = m.offsets[np.uintp(((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3))]
-    a = first + ((i & 7) * SIDE + (j & 7)) * SIDE + (k & 7)
-    return a, p[0] - i, p[1] - j, p[2] - k
-
-
-@jit
 def four_mixed(v, a, fu, fv, fw):
     """The numbers of the eight samples around a cell, mixed."""
     z, y, x = np.uintp(4), np.uintp(4 * SIDE), np.uintp(4 * SIDE * SIDE)
@@ -187,8 +174,8 @@ def four_mixed(v, a, fu, fv, fw):
 
 @jit
 def look_up(m, numbers, p):
-    """(rho, J rgb) at a point: ``lookups.interpolated`` of four numbers at a time."""
-    a, u, v, w = place(m, p)
+    """(rho, J rgb) at a point of a stored brick, given in cells: ``lookups.interpolated`` of four numbers at a time."""
+    a, u, v, w = cell_of(m, p)
     return four_mixed(numbers, np.uintp(4 * a), np.float32(u), np.float32(v), np.float32(w))
 
 

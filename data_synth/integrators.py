@@ -16,22 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
 from data_synth import channels, compiled, gather, march, parts, path, raycast, shadowmap
 from data_synth.cameras import Camera
 from data_synth.errors import InputError
-from data_synth.functions import say_faults
-from data_synth.gather import Gathered
 from data_synth.image import Picture
-from data_synth.jit import in_bands
 from data_synth.media import Medium, glows
 from data_synth.parts import Part
+from data_synth.prepared import Prepared, banded, prepared, tell_faults
 from data_synth.rng import new_rng
-from data_synth.shadowmap import ShadowMaps
-from data_synth.world import World, has_surfaces
+from data_synth.world import has_surfaces
 
 if TYPE_CHECKING:
     from data_synth.scene import Scene
@@ -71,8 +68,8 @@ class March:
             if not 1 <= value <= high:
                 raise InputError(f"{name}: expected a whole number from 1 to {high}, got {value}")
 
-    def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
-        return shadowmap.none(), None
+    def _prepare(self, scene: Scene) -> Prepared:
+        return Prepared(scene.world(self.beams), shadowmap.none(), None)
 
     def render(self, scene: Scene, camera: Camera, seed: int = 0) -> Picture:
         return self.picture(self.sums(scene, camera, seed, parts.whole(camera.height)))
@@ -85,7 +82,7 @@ class March:
         """See Integrator; rgb, alpha, distance."""
         if (scenes := scene.in_channels()) is not None:
             return channels.rendered(scenes, seed, lambda one, own: self.sums(one, camera, own, part))
-        world, maps, gathered = _prepared(self, scene)
+        world, maps, gathered = prepared(self, scene, lambda: self._prepare(scene))
         eye, mode, rho_J = camera.c2w[:3, 3], self.mode, np.empty(0, np.float32)
         if gathered is not None:
             if not gather.outside(world.medium, eye):
@@ -101,8 +98,8 @@ class March:
             else:
                 march.render_rows(world, lighting, data, self.side, scene.opaque_sky, new_rng(0, 0), out, first, last)
 
-        out = _banded(rows, out, part, 4)
-        _say_faults(world)
+        out = banded(rows, out, part, 4)
+        tell_faults(world)
         return out
 
     def picture(self, sums: np.ndarray) -> Picture:
@@ -153,7 +150,7 @@ class RayCast(March):
         def rows(first: int, last: int) -> None:
             raycast.render_rows(scan.values, table, data, self.side, out, first, last)
 
-        return _banded(rows, out, part, 4)
+        return banded(rows, out, part, 4)
 
 
 _tables: dict[
@@ -202,12 +199,13 @@ class DeepShadow(March):
         """See Integrator; whole pictures, for each of which light is gathered."""
         return [parts.whole(height)]
 
-    def _light(self, scene: Scene, world: World) -> tuple[ShadowMaps, Gathered | None]:
+    def _prepare(self, scene: Scene) -> Prepared:
+        world = scene.world(self.beams)
         together = self.resolution is None and self.fill == "sweep" and gather.possible(world)
         if together and not has_surfaces(world):
-            return shadowmap.none(), gather.gather(world)
+            return Prepared(world, shadowmap.none(), gather.gather(world))
         maps = shadowmap.build(world, MAP_RESOLUTION if self.resolution is None else self.resolution, self.fill)
-        return maps, gather.gather(world) if together else None
+        return Prepared(world, maps, gather.gather(world) if together else None)
 
 
 @dataclass(frozen=True)
@@ -241,7 +239,7 @@ class Path:
         """See Integrator; over the samples, of rgb, alpha, distance and the squares of rgb."""
         if (scenes := scene.in_channels()) is not None:
             return channels.rendered(scenes, seed, lambda one, own: self.sums(one, camera, own, part))
-        world = _prepared(self, scene).world
+        world = prepared(self, scene, lambda: Prepared(scene.world(), shadowmap.none(), None)).world
         depth = UNLIMITED if self.max_depth is None else self.max_depth
         settings = path.Settings(self.spp, depth, self.jitter, scene.opaque_sky, seed, part.first, part.last)
         if not self.textbook and compiled.core() is not None and not compiled.unknown(world):
@@ -251,8 +249,8 @@ class Path:
         def rows(first: int, last: int) -> None:
             path.render_rows(world, data, settings, new_rng(0, 0), np.empty((64, 8)), out, first, last)
 
-        out = _banded(rows, out, part, 2)
-        _say_faults(world)
+        out = banded(rows, out, part, 2)
+        tell_faults(world)
         return out
 
     def picture(self, sums: np.ndarray) -> Picture:
@@ -261,17 +259,6 @@ class Path:
         mean = sums / n
         variance = np.maximum(sums[..., 5:] - n * mean[..., :3] ** 2, 0.0) / (float(n) * max(n - 1, 1))
         return Picture(mean[..., :3], mean[..., 3], mean[..., 4], variance, n)
-
-
-def _banded(rows: Callable[[int, int], None], out: np.ndarray, part: Part, band: int) -> np.ndarray:
-    """The part's rows of ``out`` once ``rows`` has filled them, on all cores; of others not even memory is used."""
-    in_bands(lambda first, last: rows(part.top + first, part.top + last), part.bottom - part.top, band)
-    return out if part.bottom - part.top == len(out) else out[part.top : part.bottom].copy()
-
-
-def _say_faults(world: World) -> None:
-    say_faults(world.medium.faults)
-    say_faults(world.others.faults)
 
 
 INTEGRATORS: dict[str, Callable[..., Integrator]] = {
@@ -290,25 +277,3 @@ def make(name: str, **options: object) -> Integrator:
     if name not in INTEGRATORS:
         raise InputError(f"--integrator: expected one of {', '.join(INTEGRATORS)}, got '{name}'")
     return INTEGRATORS[name](**{key: value for key, value in options.items() if value is not None})
-
-
-class Prepared(NamedTuple):
-    """What an integrator makes of a scene, whatever the camera."""
-
-    world: World
-    maps: ShadowMaps
-    gathered: Gathered | None
-
-
-def _prepared(integrator: March | Path, scene: Scene) -> Prepared:
-    """Arrays and shadow maps of a scene for an integrator, kept on the scene for as long as nothing in it changes."""
-    store, key = scene.prepared, (integrator, scene.fingerprint())
-    if key not in store:
-        while len(store) > 1:
-            store.pop(next(iter(store)))
-        if isinstance(integrator, Path):
-            store[key] = Prepared(scene.world(), shadowmap.none(), None)
-        else:
-            world = scene.world(integrator.beams)
-            store[key] = Prepared(world, *integrator._light(scene, world))
-    return store[key]

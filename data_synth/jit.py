@@ -64,7 +64,8 @@ def _stamp(source: str) -> str:
         files |= todo
         todo = {each for path in todo for each in _imported(path)} - files
     texts = [path.read_bytes() for path in sorted(files) if path != Path(__file__)]
-    return hashlib.sha256(b"".join(t for t in texts if b"@jit" in t or b"@kernel" in t)).hexdigest()
+    marks = (b"@jit", b"@inlined", b"@kernel")
+    return hashlib.sha256(b"".join(t for t in texts if any(mark in t for mark in marks))).hexdigest()
 
 
 def kernel(function: Callable) -> Callable:

@@ -8,12 +8,12 @@ from data_synth import detail as details
 from data_synth import phase as phases
 from data_synth.fields import cell_at, colour, matrix, mixed
 from data_synth.functions import bounded
-from data_synth.jit import jit
+from data_synth.jit import inlined, jit
 from data_synth.media import EXPONENTIAL, FUNCTION, GRID
 from data_synth.vec import slab
 
 
-@jit
+@inlined
 def interpolated(m, values, p):
     """Interpolate brick samples ``values`` at p, 0 outside the stored bricks."""
     return mixed(values, 1, 0, cell_at(m, p))
@@ -25,7 +25,7 @@ def vertex(m, i, j, k, finer):
     return (m.lo[0] + i * m.cell[0] / finer, m.lo[1] + j * m.cell[1] / finer, m.lo[2] + k * m.cell[2] / finer)
 
 
-@jit
+@inlined
 def density(m, p):
     """rho at a point inside the box."""
     if m.kind == GRID:
@@ -41,7 +41,7 @@ def density(m, p):
     return 1.0
 
 
-@jit
+@inlined
 def attribute(m, p):
     """The attribute at a point, 0 for media that have none."""
     return interpolated(m, m.attributes, p) if m.attributes.size > 1 else 0.0
@@ -58,21 +58,21 @@ def phase_at(m, p):
     return m.phase
 
 
-@jit
+@inlined
 def albedo_at(m, p, a):
     """RGB albedo at a point with attribute a."""
     c = m.columns
     return colour(m, c.albedo, c.albedo_step, cell_at(m, p)) if c.albedo >= 0 else lookup(m.albedo, a)
 
 
-@jit
+@inlined
 def Le_at(m, p, a):
     """RGB emitted radiance at a point with attribute a."""
     c = m.columns
     return colour(m, c.Le, c.Le_step, cell_at(m, p)) if c.Le >= 0 else lookup(m.Le, a)
 
 
-@jit
+@inlined
 def extinction(m, p, d):
     """rho at p, times the projected area of microflakes towards d: sigma_t(x, d) / sigma_t."""
     rho = density(m, p)
@@ -81,20 +81,21 @@ def extinction(m, p, d):
     return rho
 
 
-@jit
-def lookup(table, a):
-    """Row of a (K, 3) table at a in [0, 1], linear in between."""
+@inlined
+def at_value(table, a, c):
+    """Column c of a table over [0, 1] at a, linear in between."""
     n = table.shape[0]
     if n == 1:
-        return (table[0, 0], table[0, 1], table[0, 2])
+        return table[0, c]
     x = min(max(a, 0.0), 1.0) * (n - 1)
     i = min(int(x), n - 2)
-    f = x - i
-    return (
-        table[i, 0] + f * (table[i + 1, 0] - table[i, 0]),
-        table[i, 1] + f * (table[i + 1, 1] - table[i, 1]),
-        table[i, 2] + f * (table[i + 1, 2] - table[i, 2]),
-    )
+    return table[i, c] + (x - i) * (table[i + 1, c] - table[i, c])
+
+
+@inlined
+def lookup(table, a):
+    """Row of a (K, 3) table over [0, 1] at a."""
+    return (at_value(table, a, 0), at_value(table, a, 1), at_value(table, a, 2))
 
 
 @jit

@@ -148,15 +148,13 @@ def normals_at(phase, attribute):
 @jit
 def projected_area(phase, attribute, w):
     """sigma(w) of the flakes."""
-    if phase.kind == FLAKES:
-        return flakes.projected_area(normals_at(phase, attribute), w)
-    return sggx.projected_area(flakes_at(phase, attribute), w)
+    return flakes.projected_area(normals_at(phase, attribute), w)
 
 
 @jit
 def has_density(phase):
     """Whether ``evaluate`` is the density itself, not a random number with it as its mean."""
-    return phase.kind < SGGX_DIFFUSE or (phase.kind == FLAKES and phase.micro == flakes.SPECULAR)
+    return phase.kind < SGGX_SPECULAR or phase.micro == flakes.SPECULAR
 
 
 @jit
@@ -191,32 +189,24 @@ def of_cosine(phase, cosine):
 @jit
 def evaluate(phase, attribute, wo, wi, rng):
     """f_p(wo, wi) in 1/sr. Flakes that are not specular alone need random numbers; their value is right on average."""
-    if phase.kind == FLAKES:
+    if phase.kind >= SGGX_SPECULAR:
         n = normals_at(phase, attribute)
         if phase.micro == flakes.SPECULAR:
-            return flakes.half_vector_density(n, wo, wi) / (4.0 * flakes.projected_area(n, wo))
+            return flakes.specular_density(n, wo, wi)
         m = flakes.sample_visible_normal(n, wo, rng)
         return flakes.micro_density(phase.micro, phase.roughness, phase.ior, m, wo, wi)
-    if phase.kind == SGGX_SPECULAR:
-        return sggx.eval_specular(flakes_at(phase, attribute), wo, wi)
-    if phase.kind == SGGX_DIFFUSE:
-        return sggx.eval_diffuse(flakes_at(phase, attribute), wo, wi, rng)
     return of_cosine(phase, -dot(wo, wi))
 
 
 @jit
 def sample(phase, attribute, wo, rng):
     """wi with density f_p(wo, .): every phase function here is sampled exactly."""
-    if phase.kind == FLAKES:
+    if phase.kind >= SGGX_SPECULAR:
         n = normals_at(phase, attribute)
         if phase.micro == flakes.SPECULAR:
             return flakes.sample_specular(n, wo, rng)
         m = flakes.sample_visible_normal(n, wo, rng)
         return flakes.micro_sample(phase.micro, phase.roughness, phase.ior, m, wo, rng)
-    if phase.kind == SGGX_SPECULAR:
-        return sggx.sample_specular(flakes_at(phase, attribute), wo, rng)
-    if phase.kind == SGGX_DIFFUSE:
-        return sggx.sample_diffuse(flakes_at(phase, attribute), wo, rng)
     u = uniform(rng)
     if phase.kind == HG:
         cosine = hg_cosine(phase.g1 if uniform(rng) < phase.mix else phase.g2, u)

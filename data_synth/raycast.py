@@ -21,12 +21,13 @@ import numpy as np
 from data_synth import media
 from data_synth.cameras import picture_rows
 from data_synth.errors import InputError
+from data_synth.fields import cell_of, mixed
 from data_synth.gather import in_cells
 from data_synth.jit import inlined, jit, kernel
-from data_synth.lookups import box_interval
-from data_synth.media import SIDE, Medium, Point
+from data_synth.lookups import at_value, box_interval
+from data_synth.media import Medium, Point
 from data_synth.traverse import lattice, traversal
-from data_synth.vec import along, bilinear, dot, scale, trilinear
+from data_synth.vec import along, bilinear, dot, scale
 
 UNSHADED, LAMBERT, PHONG = range(3)
 SHADING = {"none": UNSHADED, "lambert": LAMBERT, "phong": PHONG}
@@ -132,15 +133,8 @@ def pre_integrated(points: np.ndarray, thickness: float, inside: int = 64) -> np
 def value(m, p):
     """v at a point that is given in cells from the lowest corner; outside of the box as at its nearest point."""
     n = m.cells
-    x, y, z = min(max(p[0], 0.0), n[0]), min(max(p[1], 0.0), n[1]), min(max(p[2], 0.0), n[2])
-    i, j, k = min(int(x), n[0] - 1), min(int(y), n[1] - 1), min(int(z), n[2] - 1)
-    brick = m.offsets[np.uintp(((i >> 3) * m.bricks[1] + (j >> 3)) * m.bricks[2] + (k >> 3))]
-    a = np.uintp(brick + ((i & 7) * SIDE + (j & 7)) * SIDE + (k & 7))
-    one, row, plane = np.uintp(1), np.uintp(SIDE), np.uintp(SIDE * SIDE)
-    v, b = m.samples, a + plane
-    near = (v[a], v[a + one], v[a + row], v[a + row + one])
-    far = (v[b], v[b + one], v[b + row], v[b + row + one])
-    return trilinear(near + far, x - i, y - j, z - k) - SHIFT  # noqa: RUF005
+    inside = (min(max(p[0], 0.0), n[0]), min(max(p[1], 0.0), n[1]), min(max(p[2], 0.0), n[2]))
+    return mixed(m.samples, 1, 0, cell_of(m, inside)) - SHIFT
 
 
 @jit
@@ -152,15 +146,6 @@ def gradient_at(m, p):
         (value(m, (x, y + 1.0, z)) - value(m, (x, y - 1.0, z))) / (2.0 * m.cell[1]),
         (value(m, (x, y, z + 1.0)) - value(m, (x, y, z - 1.0))) / (2.0 * m.cell[2]),
     )
-
-
-@inlined
-def at_value(points, v, c):
-    """Column c of the function of a value, linear in between."""
-    n = points.shape[0]
-    x = min(max(v, 0.0), 1.0) * (n - 1)
-    i = min(int(x), n - 2)
-    return points[i, c] + (x - i) * (points[i + 1, c] - points[i, c])
 
 
 @inlined

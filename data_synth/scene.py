@@ -19,8 +19,9 @@ from data_synth.cameras import Camera, Viewpoints
 from data_synth.channels import Channels, split
 from data_synth.errors import InputError, RenderWarning
 from data_synth.image import Picture
-from data_synth.integrators import Integrator, Prepared, make
+from data_synth.integrators import Integrator, make
 from data_synth.pool import pool
+from data_synth.prepared import Prepared
 from data_synth.raycast import Classified
 from data_synth.world import COUNTERS, World
 

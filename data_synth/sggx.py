@@ -4,9 +4,7 @@ S is a symmetric positive definite 3x3 matrix, stored as the tuple (xx, yy, zz, 
     projected area   sigma(w) = sqrt(w' S w)
     normals          D(m) = 1 / (pi sqrt|S| (m' S^-1 m)^2)
     visible normals  D_w(m) = max(w.m, 0) D(m) / sigma(w)
-    specular phase   f_p(wo -> wi) = D(h) / (4 sigma(wo)),  h = (wo + wi) / |wo + wi|
-    diffuse phase    f_p(wo -> wi) = 1/pi  integral of max(wi.m, 0) D_wo(m) dm
-All directions point outward, away from the point.
+Phase functions of SGGX flakes, as of those of any distribution, are in ``microflakes.py`` and ``phase.py``.
 """
 
 import math
@@ -17,7 +15,7 @@ from numpy.typing import ArrayLike
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.rng import uniform
-from data_synth.vec import add, dot, frame, scale, sphere_direction, sub, unit
+from data_synth.vec import add, dot, frame, scale, unit
 
 
 def fibre(axis: ArrayLike, roughness: float) -> np.ndarray:
@@ -107,37 +105,3 @@ def sample_visible_normal(s, w, rng):
     mj = v * inv_sii * tmp + n * inv_sii * sji
     mi = n * inv_sii * sii
     return unit(add(add(scale(mk, k), scale(mj, j)), scale(mi, w)))
-
-
-@jit
-def half_vector_density(s, wo, wi):
-    h = add(wo, wi)
-    length = math.sqrt(dot(h, h))
-    if length < 1e-12:  # exactly forward: the half vector is any normal across the ray, never sampled
-        return 0.0
-    return normal_density(s, scale(1.0 / length, h))
-
-
-@jit
-def eval_specular(s, wo, wi):
-    return half_vector_density(s, wo, wi) / (4.0 * projected_area(s, wo))
-
-
-@jit
-def sample_specular(s, wo, rng):
-    """wi with density f_p: mirror wo at a visible normal."""
-    m = sample_visible_normal(s, wo, rng)
-    return unit(sub(scale(2.0 * dot(wo, m), m), wo))
-
-
-@jit
-def eval_diffuse(s, wo, wi, rng):
-    """One unbiased sample of the diffuse phase function: the integral has no closed form."""
-    return max(dot(wi, sample_visible_normal(s, wo, rng)), 0.0) / math.pi
-
-
-@jit
-def sample_diffuse(s, wo, rng):
-    """wi with density f_p: cosine-distributed about a visible normal."""
-    m = sample_visible_normal(s, wo, rng)
-    return sphere_direction(m, math.sqrt(1.0 - uniform(rng)), 2.0 * math.pi * uniform(rng))

@@ -179,7 +179,7 @@ def pdf(layers, first, last, wo, wi):
         k = first + n if wo[2] > 0.0 else last - 1 - n
         s = flakes(layers, k)
         through = math.exp(-layers.rows[k, 0] * slant(s, wo))
-        f = microflakes.half_vector_density(s, wo, wi) / (4.0 * microflakes.projected_area(s, wo))
+        f = microflakes.specular_density(s, wo, wi)
         total += reach * (1.0 - through) * f
         reach *= through
     return total

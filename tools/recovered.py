@@ -4,10 +4,14 @@
 
 ``nerfvol eval --truth`` compares inside the whole box of a density; a floor or a ball in it would count as error. Here points
 and chords are drawn at random in the medium's box, and those count that are nowhere within ``MARGIN`` of a solid.
+
+A few opaque cells can hold most of the sum of a density and yet hardly be in a picture. So the density is also compared
+weighted by how well it is seen: by the mean transmittance, through the octree, between a point and the scene's cameras.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -20,13 +24,16 @@ import data_synth as ds
 from data_synth import lookups, media, surfaces
 from data_synth.scenes.showcase import Showcase, haze_density
 from data_synth.scenes.showcase_sdf import distance
-from nerfvol.measure.truth import random_chords
+from nerfvol.kernels import ops
+from nerfvol.measure.truth import random_chords, within_box
 from nerfvol.models import load_model
 from nerfvol.octree.points import octree_density
+from nerfvol.octree.tree import Octree
 from nerfvol.views import OctreeModel
 
 MARGIN = 0.06  # u: some of the finest cells that a short training has
-POINTS, SAMPLES = 3000, 96  # of the density; along a chord
+SPACING = MARGIN / 2  # u: of the points that are asked along a chord, so that no solid is stepped over
+POINTS, CHORDS, CAMERAS = 3000, 400, 24
 Field = Callable[[float, float, float], float]
 
 
@@ -50,14 +57,42 @@ def known(name: str) -> tuple[np.ndarray, np.ndarray, Field, Callable[[float, fl
     return np.array(m.lo), np.array(m.hi), lambda x, y, z: m.sigma_t[1] * lookups.density(m, (x, y, z)), clear
 
 
-def compare(found: np.ndarray, truth: np.ndarray) -> str:
-    """Relative L1, Pearson's correlation, and sums."""
+def compare(found: np.ndarray, truth: np.ndarray, weight: np.ndarray | float = 1.0) -> str:
+    """Relative L1, Pearson's correlation, sums, and the middle one of the ratios."""
     constant = np.ptp(truth) <= 1e-9
     correlation = "none: the true one is constant" if constant else f"{np.corrcoef(found, truth)[0, 1]:.3f}"
+    total = (weight * truth).sum()
     return (
-        f"relative L1 {np.abs(found - truth).sum() / truth.sum():.3f}, correlation {correlation}, "
-        f"found/true {found.sum() / truth.sum():.3f} ({len(truth)})"
+        f"relative L1 {(weight * np.abs(found - truth)).sum() / total:.3f}, correlation {correlation}, "
+        f"found/true {(weight * found).sum() / total:.3f}, median {np.median(found / truth):.3f} ({len(truth)})"
     )
+
+
+def seen(octree: Octree, points: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+    """(n,) mean transmittance of ``octree`` between points (n, 3) and eyes (m, 3) outside of it."""
+    o = np.repeat(points, len(eyes), axis=0)
+    d = np.tile(eyes, (len(points), 1)) - o
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    opacity = ops.render_rays(octree, o, d, early_stop_eps=0.0, outputs=("opacity",))["opacity"]
+    return 1 - opacity.reshape(len(points), len(eyes)).mean(axis=1, dtype=np.float64)
+
+
+def clear_chords(
+    lo: np.ndarray, hi: np.ndarray, sigma: Field, clear: Callable[[float, float, float], bool]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(start (n, 3), direction (n, 3), true opacity (n,)) of chords through the box that meet no solid."""
+    starts, directions, opacities = [], [], []
+    for o, d, length in zip(*random_chords(lo, hi), strict=True):
+        if length > 0.3:
+            n = math.ceil(length / SPACING)
+            along = o + (np.arange(n)[:, None] + 0.5) / n * length * d
+            if all(clear(*p) for p in along):
+                starts.append(o)
+                directions.append(d)
+                opacities.append(-math.expm1(-np.mean([sigma(*p) for p in along]) * length))
+        if len(starts) == CHORDS:
+            break
+    return np.array(starts), np.array(directions), np.array(opacities)
 
 
 def main(argv: list[str]) -> int:
@@ -70,16 +105,15 @@ def main(argv: list[str]) -> int:
     octree = model.octree
     points = lo + np.random.default_rng(0).random((POINTS, 3)) * (hi - lo)
     points = points[[clear(*p) for p in points]]
-    print("density: ", compare(octree_density(octree, points), np.array([sigma(*p) for p in points])))
-    taken = []
-    for o, d, length in zip(*random_chords(lo, hi), strict=True):
-        along = o + (np.arange(SAMPLES)[:, None] + 0.5) / SAMPLES * length * d
-        if length > 0.3 and all(clear(*p) for p in along[::4]):
-            truth = np.array([sigma(*p) for p in along]).mean() * length
-            taken.append((1 - np.exp(-octree_density(octree, along).mean() * length), 1 - np.exp(-truth)))
-        if len(taken) == 400:
-            break
-    print("opacity: ", compare(*np.array(taken).T))
+    density, truth = octree_density(octree, points), np.array([sigma(*p) for p in points])
+    eyes = np.array([camera.c2w[:3, 3] for camera in ds.scenes.make(name).viewpoints.spread(CAMERAS, 8, 8, 0)])
+    print("density:  ", compare(density, truth))
+    print("  as seen:", compare(density, truth, seen(octree, points, eyes)))
+    start, direction, truth = clear_chords(lo, hi, sigma, clear)
+    medium, opacity = within_box(octree, lo, hi, SPACING), np.zeros(len(start))
+    if medium is not None:
+        opacity = ops.render_rays(medium, start, direction, early_stop_eps=0.0, outputs=("opacity",))["opacity"]
+    print("opacity:  ", compare(opacity.astype(np.float64), truth))
     return 0
 
 

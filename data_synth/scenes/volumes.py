@@ -75,10 +75,16 @@ def cumulonimbus(coverage: float = 0.92, density: float = 30.0, resolution: int 
     )
 
 
-def stratus(coverage: float = 0.60, density: float = 18.0, resolution: int = 160, seed: int = 1) -> Scene:
-    """a broken layer of stratus, seen from above and below"""
+def stratus(
+    coverage: float = 0.60, density: float = 18.0, resolution: int = 160, seed: int = 1, scale: float = 1.6,
+    erosion: float = 0.35,
+) -> Scene:  # fmt: skip
+    """a broken layer of stratus, seen from above and below
+
+    scale: how many tiles of the noise along the layer: the more, the smaller its clouds. erosion: by detail, in [0, 1).
+    """
     lo, hi = (-1.6, -1.6, -0.3), (1.6, 1.6, 0.3)
-    rho = clouds.cloud("stratus", (resolution, resolution, resolution // 4), coverage, 1.6, 0.35, seed)
+    rho = clouds.cloud("stratus", (resolution, resolution, resolution // 4), coverage, scale, erosion, seed)
     medium = media.grid(rho, lo, hi, density, 0.99, phase=CLOUD_PHASE)
     return Scene(
         medium=medium,

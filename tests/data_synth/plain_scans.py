@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_synth import Camera, look_at, raycast, scenes, transfer, volumes
+from data_synth import Camera, look_at, lookups, raycast, scenes, transfer, volumes
 from data_synth.errors import InputError
 from data_synth.integrators import Emission, March, RayCast
 from data_synth.scene import Scene
@@ -81,11 +81,11 @@ def test_bricks_bound_the_opacity_between_samples():
     v = np.random.default_rng(0).choice([0.2, 0.9], (12, 12, 12))
     c = raycast.classified(v, (0, 0, 0), (1, 1, 1), PEAK, SIGMA)
     u = np.random.default_rng(1).random((2000, 3))
-    found = np.array([raycast.at_value(c.points, raycast.value(c.values, tuple(11 * p)), 0) for p in u])
+    found = np.array([lookups.at_value(c.points, raycast.value(c.values, tuple(11 * p)), 0) for p in u])
     brick = np.ravel_multi_index(((u * 11).astype(int) // 8).T, c.values.bricks)
     assert found.max() > 0.5 and (found <= c.values.brick_max[brick]).all()
     even = raycast.classified(np.full((9, 9, 9), 0.59), (0, 0, 0), (1, 1, 1), SMOOTH, SIGMA)
-    assert even.values.brick_max[0] >= raycast.at_value(even.points, 0.59, 0) - 1e-6
+    assert even.values.brick_max[0] >= lookups.at_value(even.points, 0.59, 0) - 1e-6
     empty = raycast.classified(np.full((12, 12, 12), 0.4), (0, 0, 0), (1, 1, 1), PEAK, SIGMA)
     assert empty.values.brick_max[0] == 0.0  # and is skipped
 
