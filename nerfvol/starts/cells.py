@@ -159,7 +159,9 @@ def _search(
     return np.concatenate(levels), np.concatenate(done)
 
 
-def largest_sigma(field: PointField, cells: np.ndarray, origin: np.ndarray, edge: float, points: np.ndarray) -> np.ndarray:
+def largest_sigma(
+    field: PointField, cells: np.ndarray, origin: np.ndarray, edge: float, points: np.ndarray
+) -> np.ndarray:
     """Largest coefficient among ``points`` (p, 3) in [0, 1] of each cell: (n,) float32.
 
     Cells (n, 3), in units of their side ``edge``, begin at origin + cells * edge.

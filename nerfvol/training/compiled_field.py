@@ -176,8 +176,8 @@ class CompiledFieldTrainer:
         return self.trained_field().picture(camera)
 
     def trained_field(self) -> CompiledField:
-        """The field without what it holds in space that training skips: what is to be rendered or distilled. Its steps along rays
-        are the finest, which show more than those that it has been trained with so far."""
+        """The field without what it holds in space that training skips: what is to be rendered or distilled. Its steps along
+        rays are the finest, which show more than those that it has been trained with so far."""
         self.state.use_levels(self.state.n_levels)  # as it will be read from a file
         return CompiledField(self.state, self.march.with_steps(self.config.march_steps[-1]), self.background)
 
