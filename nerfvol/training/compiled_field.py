@@ -176,10 +176,11 @@ class CompiledFieldTrainer:
         return self.trained_field().picture(camera)
 
     def trained_field(self) -> CompiledField:
-        """The field without what it holds in space that training skips: what is to be rendered or distilled. Its steps along rays
-        are the finest, which show more than those that it has been trained with so far."""
+        """The field without what it holds in space that training skips: what is to be rendered or distilled. An object is drawn
+        with the finest steps, which show more than those that it was trained with; of photographs haze would take too long."""
         self.state.use_levels(self.state.n_levels)  # as it will be read from a file
-        return CompiledField(self.state, self.march.with_steps(self.config.march_steps[-1]), self.background)
+        march = self.march if self.domain.outer > 1 else self.march.with_steps(self.config.march_steps[-1])
+        return CompiledField(self.state, march, self.background)
 
     def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See FinalPhase."""

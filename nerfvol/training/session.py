@@ -40,7 +40,11 @@ from nerfvol.training.prepare import Data, claim_folder
 from nerfvol.views import OctreeModel, SplatModel
 
 RESERVE_SHARE = 0.2
-"""Of a time budget, the most that is kept for writing and scoring."""
+"""Of a time budget, the most that is kept for writing and scoring, ..."""
+LARGEST_RESERVE = 0.5
+"""... or this, where the table of photographs and FEWEST_SCORED views, which are drawn in any case, take more."""
+FEWEST_SCORED = 2
+"""Held-out views that are scored however long they take."""
 EXPECTED_SECONDS_TO_WRITE = 2.0
 """Of an octree, before there is one that tells ..."""
 SECONDS_TO_WRITE = 0.5
@@ -392,13 +396,11 @@ class Run:
                 camera = self.data.training.cameras[0]
                 lens = camera.intrinsics
                 small = _seconds_of_picture(phase, camera.scaled(fitting_factor(lens.width, lens.height)))
-        return min(
-            writing
-            + self.data.reading
-            + (TABLE_SECONDS + small) * rows
-            + 1.1 * len(self.data.held_out) * (self._scoring + rendering + FIT_SECONDS * self.config.refine_poses),
-            RESERVE_SHARE * self.config.time_budget,
-        )
+        table = (TABLE_SECONDS + small) * rows
+        view = self._scoring + rendering + FIT_SECONDS * self.config.refine_poses
+        all_views, budget = 1.1 * len(self.data.held_out) * view, self.config.time_budget
+        most = min(table + FEWEST_SCORED * view, LARGEST_RESERVE * budget) if phase is not None else 0.0
+        return min(writing + self.data.reading + table + all_views, max(RESERVE_SHARE * budget, most))
 
 
 def _seconds_of_picture(phase: Phase, camera: Camera) -> float:
