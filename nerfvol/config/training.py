@@ -344,6 +344,8 @@ def finest_level(side: int) -> int:
     return (2 * side).bit_length() - 1
 
 
+SHORT_RUN = 10.0
+"""Seconds of a time budget up to which an octree does not begin as a field: distilling it would take most of them."""
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,
            "sparsity": 0.0, "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000}  # fmt: skip
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
@@ -490,11 +492,13 @@ class Config(Checked):
 
     def for_views(self, n: int, scene: SceneBounds) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
-        few views show a field leaves less open than low density does (docs/experiments.md); smoothness in any case."""
+        few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
+        smoothness in any case."""
         few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
         if not few:
             return self
-        init = "mlp" if self.init == "auto" else self.init
+        short = self.time_budget is not None and self.time_budget <= SHORT_RUN
+        init = "mlp" if self.init == "auto" and not short else self.init
         return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS))
 
     def for_pictures(self, side: int) -> Config:
