@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
+SHORT_RUN = 10.0
+"""Seconds of a time budget up to which an octree does not begin as a field: distilling it would take most of them."""
 OCTREE_STARTS = ("direct", "mlp")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
@@ -142,11 +144,13 @@ class Config(Checked):
 
     def for_views(self, n: int, scene: SceneBounds) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
-        few views show a field leaves less open than low density does (docs/experiments.md); smoothness in any case."""
+        few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
+        smoothness in any case."""
         few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
         if not few:
             return self
-        init = "mlp" if self.init == "auto" else self.init
+        short = self.time_budget is not None and self.time_budget <= SHORT_RUN
+        init = "mlp" if self.init == "auto" and not short else self.init
         return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS))
 
     def for_pictures(self, side: int) -> Config:

@@ -7,21 +7,12 @@ Distances t are in scene units along unit directions. Random numbers come in as 
 import torch
 from torch import Tensor
 
-_MASK = (1 << 64) - 1
+from nerfvol.field.counters import mixed
 
 
 def step_generator(seed: int, step: int, stream: int = 0) -> torch.Generator:
-    """Generator that depends on (seed, step, stream) alone.
-
-    The three counters are mixed by splitmix64 (Steele, Lea and Flood 2014), so that neighbouring steps are unrelated.
-    """
-    state = 0
-    for counter in (seed, step, stream):
-        state = (state + counter * 0xD1342543DE82EF95 + 0x9E3779B97F4A7C15) & _MASK
-        state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
-        state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) & _MASK
-        state ^= state >> 31
-    return torch.Generator().manual_seed(state >> 1)
+    """Generator that depends on (seed, step, stream) alone."""
+    return torch.Generator().manual_seed(mixed(seed, step, stream) >> 1)
 
 
 def intersect_aabb(rays_o: Tensor, rays_d: Tensor, aabb: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Training of a field by the compiled kernels, step by step; ``field_trainer`` has the same in torch and chooses.
+"""Training of a field by the compiled kernels, step by step; ``field_trainer`` has the same in torch, ``field_start`` chooses.
 
 Every random number of step k comes from (seed, k), and all that lives between steps is in ``state_dict``: the same seed gives
 the same bits for any number of threads, stopped and resumed or not. What the schedule is worth: docs/experiments.md.
@@ -15,6 +15,7 @@ import numpy as np
 
 from nerfvol.config.field import FieldConfig
 from nerfvol.errors import InputError
+from nerfvol.field.counters import mixed
 from nerfvol.field.layout import Domain
 from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_model import CompiledField
@@ -38,17 +39,6 @@ FEW_WIDTH = 64
 many views it only costs time."""
 SECONDS_TO_WRITE = 0.3
 """Of a field that is the product."""
-
-
-def _key(seed: int, step: int) -> int:
-    """64 bits that depend on both alone, mixed as in field.sampling.step_generator."""
-    key = 0
-    for word in (seed, step):
-        key = (key + word * 0xD1342543DE82EF95 + 0x9E3779B97F4A7C15) % 2**64
-        key = (key ^ key >> 30) * 0xBF58476D1CE4E5B9 % 2**64
-        key = (key ^ key >> 27) * 0x94D049BB133111EB % 2**64
-        key ^= key >> 31
-    return key
 
 
 def compiled_refusal(config: FieldConfig) -> str | None:
@@ -83,7 +73,7 @@ class Pixels:
         """Random pixels, evenly over all pictures."""
         o, d, target = (np.empty((n_rays, 3), np.float32) for _ in range(3))
         jitter = np.empty(n_rays, np.float32)
-        self._drawn(self._pixels, _key(seed, step), o, d, target, jitter)
+        self._drawn(self._pixels, mixed(seed, step), o, d, target, jitter)
         return FieldBatch(o, d, target, jitter)
 
 
@@ -176,10 +166,11 @@ class CompiledFieldTrainer:
         return self.trained_field().picture(camera)
 
     def trained_field(self) -> CompiledField:
-        """The field without what it holds in space that training skips: what is to be rendered or distilled. Its steps along
-        rays are the finest, which show more than those that it has been trained with so far."""
+        """The field without what it holds in space that training skips: what is to be rendered or distilled. An object is drawn
+        with the finest steps, which show more than those that it was trained with; of photographs haze would take too long."""
         self.state.use_levels(self.state.n_levels)  # as it will be read from a file
-        return CompiledField(self.state, self.march.with_steps(self.config.march_steps[-1]), self.background)
+        march = self.march if self.domain.outer > 1 else self.march.with_steps(self.config.march_steps[-1])
+        return CompiledField(self.state, march, self.background)
 
     def seen(self, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See FinalPhase."""

@@ -18,7 +18,11 @@ from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data
 
 RESERVE_SHARE = 0.2
-"""Of a time budget, the most that is kept for writing and scoring."""
+"""Of a time budget, the most that is kept for writing and scoring, ..."""
+LARGEST_RESERVE = 0.5
+"""... or this, where the table of photographs and FEWEST_SCORED views, which are drawn in any case, take more."""
+FEWEST_SCORED = 2
+"""Held-out views that are scored however long they take."""
 EXPECTED_SECONDS_TO_WRITE = 2.0
 """Of an octree, before there is one that tells ..."""
 SECONDS_TO_WRITE = 0.5
@@ -52,13 +56,11 @@ def seconds_to_finish(config: Config, data: Data, scoring: float, phase: Phase |
             camera = data.training.cameras[0]
             lens = camera.intrinsics
             small = seconds_of_picture(phase, camera.scaled(fitting_factor(lens.width, lens.height)))
-    return min(
-        writing
-        + data.reading
-        + (TABLE_SECONDS + small) * rows
-        + 1.1 * len(data.held_out) * (scoring + rendering + FIT_SECONDS * config.refine_poses),
-        RESERVE_SHARE * (config.time_budget or math.inf),
-    )
+    table = (TABLE_SECONDS + small) * rows
+    view = scoring + rendering + FIT_SECONDS * config.refine_poses
+    all_views, budget = 1.1 * len(data.held_out) * view, config.time_budget or math.inf
+    most = min(table + FEWEST_SCORED * view, LARGEST_RESERVE * budget) if phase is not None else 0.0
+    return min(writing + data.reading + table + all_views, max(RESERVE_SHARE * budget, most))
 
 
 def seconds_of_picture(phase: Phase, camera: Camera) -> float:

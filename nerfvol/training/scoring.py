@@ -9,9 +9,8 @@ from nerfvol.datasets.dataset import Dataset, evenly
 from nerfvol.kernels import ops
 from nerfvol.measure.scores import evaluate, scored_views, summarised
 from nerfvol.models import Model
+from nerfvol.training.finishing import FEWEST_SCORED
 from nerfvol.training.session import Run
-
-FEWEST_SCORED = 2
 
 
 def affordable_scores(run: Run, model: Model, held_out: Dataset) -> dict[str, Any]:

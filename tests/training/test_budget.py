@@ -229,6 +229,18 @@ def test_a_field_tells_what_a_picture_takes_by_a_small_one(tmp_path, tiny_scene,
         assert kept == pytest.approx(run.data.reading + 1.1e-3 * views * lens.width * lens.height, rel=1e-3)
 
 
+@pytest.mark.parametrize("seconds, kept", [(0.01, 2.0), (1.5, 3.0), (100.0, 5.0)])
+def test_views_that_are_drawn_in_any_case_have_their_time(tmp_path, tiny_scene, monkeypatch, seconds, kept):
+    """By a clock that goes on so many seconds a picture, 10 s in all: a fifth, two views, half."""
+    now = [0.0]
+    phase = Pretended("octree", writing=100.0)
+    monkeypatch.setattr(session.time, "perf_counter", lambda: now[0])
+    phase.picture = lambda camera: now.__setitem__(0, now[0] + seconds)
+    run = run_of(settings(tiny_scene, tmp_path, time_budget=10.0))
+    assert run._time_to_finish(phase) == pytest.approx(kept)
+    assert run._time_to_finish() == pytest.approx(2.0)  # nothing is known of its pictures
+
+
 def test_previews_take_a_hundredth_of_a_budget_at_most(tmp_path, tiny_scene, monkeypatch):
     """By a clock that goes on 0.3 s a preview: one before it is known what they take, none that would exceed the share."""
 

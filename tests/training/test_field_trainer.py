@@ -12,11 +12,13 @@ from nerfvol.cameras.camera import Intrinsics, orbit
 from nerfvol.config.field import FieldConfig, FieldShape
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
+from nerfvol.field.rendering import importance_samples, render_field
 from nerfvol.field.sampling import intersect_aabb, step_generator
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.region import SceneBounds
 from nerfvol.training.field_phase import domain_of
-from nerfvol.training.field_trainer import FieldTrainer, PixelBank, importance_samples, render_field
+from nerfvol.training.field_trainer import FieldTrainer
+from nerfvol.training.pixel_bank import PixelBank
 
 TINY = FieldConfig(
     shape=FieldShape(width=16, hash_levels=4, hash_log2_table=10, hash_min=4, hash_max=24),
