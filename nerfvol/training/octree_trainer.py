@@ -173,7 +173,9 @@ class OctreeTrainer(GrowingOctree):
         self.stage_steps = np.array(state.get("stage_steps", self.stage_steps), np.int64)
         if self.stage_steps.shape != (len(self.config.levels),):
             raise InputError(
-                f"checkpoint: stage_steps does not fit the {len(self.config.levels)} stages of the settings"
+                f"the checkpoint counts the steps of {self.stage_steps.size} stages, and the settings have "
+                f"{len(self.config.levels)}: earlier versions had fewer for pictures of 1,024 pixels and more; begin the "
+                "run again"
             )
         self.cursors = Cursors.of(state["cursors"])
         self.appearance.load_state_dict(state["appearance"])

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.config.training import Config, OctreeConfig
+from nerfvol.datasets.dataset import Dataset
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import psnr
 from nerfvol.region import SceneBounds
@@ -161,4 +163,26 @@ def test_what_is_looked_at_are_the_pictures_of_the_fit(converted):
         0,
         4,
         8,
+    ]
+
+
+@pytest.mark.parametrize("is_unbounded", [False, True])
+def test_photographs_are_tuned_with_settings_of_their_own(monkeypatch, is_unbounded):
+    """Those that nobody chose; what was chosen stays, and objects have what they always have."""
+    seen = []
+
+    def trainer(dataset, background, settings, seed, octree):
+        seen.append(settings)
+        raise StopIteration
+
+    monkeypatch.setattr(convert, "OctreeTrainer", trainer)
+    scene = SceneBounds(SCENE.aabb, np.array([[-4.0] * 3, [4.0] * 3]) if is_unbounded else None, False)
+    dataset = Dataset(cameras(2, 0), [np.zeros((64, 64, 3), np.uint8)] * 2, ["a", "b"], scene, "two views")
+    for config in (Config(), Config(octree=OctreeConfig(sparsity=0.5))):
+        with pytest.raises(StopIteration):
+            convert.tuned_octree(None, dataset, WHITE, config)
+    own = convert.TUNED_PHOTOGRAPHS if is_unbounded else {"sparsity": None, "decay_from": None}
+    assert [(s.sparsity, s.decay_from) for s in seen] == [
+        (own["sparsity"], own["decay_from"]),
+        (0.5, own["decay_from"]),
     ]

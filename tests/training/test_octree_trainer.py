@@ -7,15 +7,17 @@ import weakref
 import numpy as np
 import pytest
 
-from nerfvol.cameras.camera import Camera, Intrinsics
+from nerfvol.cameras.camera import Camera, Intrinsics, look_at
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.load import load_dataset
+from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.measure.leaf_width import visible_widths
 from nerfvol.octree.rows import DENSITY_SLOT, explin_inverse
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
+from nerfvol.region import SceneBounds
 from nerfvol.training import octree_schedule
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.views import render_image
@@ -386,3 +388,61 @@ def test_the_last_pruning_keeps_what_no_ray_has_met_yet(tiny_scene):
     centers = tuner.octree.leaf_centers()
     assert tuner.config.foreground_share * tuner.tiles_seen < 2 * len(tuner.bank.foreground_tiles)
     assert (tuner.finish().query(centers) >= 0).all()
+
+
+def slab(level: int, half: int) -> Octree:
+    """A flat piece of leaves of this level around the middle of [-1, 1]^3, ``half`` to each side, two deep: opaque and grey."""
+    middle = 1 << (level - 1)
+    xy = np.arange(middle - half, middle + half)
+    cells = np.stack(np.meshgrid(xy, xy, [middle - 1, middle], indexing="ij"), -1).reshape(-1, 3)
+    octree = Octree.from_leaves(np.full(len(cells), level), cells, (-1, -1, -1), 2.0, 1, 150.0)
+    octree.density[:] = explin_inverse(2.0 / octree.leaf_sizes()[0] / octree.density_scale)
+    return octree
+
+
+def coarse_share(n: int) -> float:
+    """Share of the expected square of a piecewise linear function on n intervals, of independent values at their ends, that
+    its projection to n / 2 intervals keeps; of products of such functions in two directions, the square of that."""
+    mass = (np.diag([2.0] + [4.0] * (n - 1) + [2.0]) + np.eye(n + 1, k=1) + np.eye(n + 1, k=-1)) / 6
+    coarse = np.maximum(0, 1 - np.abs(np.arange(n + 1)[:, None] - 2 * np.arange(n // 2 + 1)) / 2)
+    onto = mass @ coarse
+    return float(np.trace(onto @ np.linalg.solve(coarse.T @ onto, onto.T)) / np.trace(mass))
+
+
+def test_pictures_of_more_than_a_thousand_pixels_are_trained_beyond_level_10(monkeypatch):
+    """Of a piece with the detail of level 11, seen in pictures in which such a leaf is 1.2 pixels wide: the stage after the
+    plain schedule's last is entered and splits its leaves, and the error falls below what the best field of level 10 would
+    have; an older version's checkpoint, which knows nothing of that stage, gets a sentence."""
+    monkeypatch.setattr(octree_schedule, "FINER_STEPS", 10)
+    truth = slab(11, 32)
+    coefficients = truth.sh
+    coefficients[..., 0] = np.random.default_rng(0).uniform(-1.5, 1.5, (truth.n_vertices, 3))
+    truth.sh = coefficients
+    lens = Intrinsics(1024, 1024, 1500, 1500, 512, 512)
+    cameras = [Camera(lens, look_at((0.1 * i - 0.1, 0.07 * i - 0.1, 1.2), (0, 0, 0), (0, 1, 0))) for i in range(3)]
+    images = [
+        np.rint(np.clip(render_image(truth, c, (1, 1, 1), lod=0)["rgb"], 0, 1) * 255).astype(np.uint8) for c in cameras
+    ]
+    scene = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, False)
+    dataset = Dataset(cameras, images, list("abc"), scene, "a piece")
+    config = dataclasses.replace(OctreeConfig().for_pictures(1024), tiles=[24] * 8, prune_steps=4)
+    assert config.levels[-2:] == [10, 11]
+    trainer = OctreeTrainer(dataset, (1, 1, 1), config, 0, slab(10, 16))
+
+    def error() -> float:
+        shown = (render_image(trainer.octree, c, (1, 1, 1), lod=0)["rgb"] for c in cameras)
+        return float(sum(((np.clip(a, 0, 1) - b / 255) ** 2).sum() for a, b in zip(shown, images, strict=True)))
+
+    steps = 160
+    for step in range(steps):
+        trainer.step(step / steps)
+        assert trainer.octree.max_level == (11 if trainer.stage == 7 else 10)
+    assert trainer.stage == 7 and trainer.stage_steps[6:].min() > 0 and trainer.stage_steps.sum() == steps
+    piece = np.concatenate([image[(image != 255).any(2)] / 255 for image in images])
+    assert error() < 0.9 * (1 - coarse_share(64) ** 2) * ((piece - piece.mean(0)) ** 2).sum()
+    state = trainer.state_dict()
+    again = OctreeTrainer(dataset, (1, 1, 1), config, 0, slab(10, 16))
+    again.load_state_dict(state)
+    assert again.stage == 7 and np.array_equal(again.octree.values, trainer.octree.values)
+    with pytest.raises(InputError, match="counts the steps of 7 stages, and the settings have 8"):
+        again.load_state_dict({**state, "stage_steps": state["stage_steps"][:7]})
