@@ -61,7 +61,7 @@ ROWS = (
     Row("to-splats-data", "convert MADE/octree/out --to splats --data DATA --out OUT/s.ply", "s.ply"),
     Row("field-to-octree", "convert MADE/field/out --to octree --data DATA --out OUT/o.safetensors", "o.safetensors"),
     Row("export-grid", "export MADE/octree/out --resolution 96 --out OUT/o.npy", "o.npy"),
-    Row("export-vdb", "export MADE/octree/out --resolution 96 --out OUT/o.vdb", "o.vdb"),
+    Row("export-vdb", "export MADE/octree/out --out OUT/o.vdb", "o.vdb"),
     Row("export-splats", "export MADE/splats/out --out OUT/s.spz", "s.spz"),
     Row("export-page", "export MADE/splats/out --out OUT/page.html", "page.html"),
     Row("render", "render MADE/octree/out --orbit 12 --size 64x64 --out OUT", "*.png"),
