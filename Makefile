@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test core wheels lint sanitize clang no-compiler recipes clients wasm mutants fuzz clean
+.PHONY: demo test core wheels lint sanitize clang no-compiler recipes clients wasm mutants fuzz faults clean
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -71,6 +71,11 @@ mutants: $(BIN)/python
 fuzz: $(BIN)/python
 	$(BIN)/pip install -q -c constraints.txt '.[test]'
 	$(BIN)/python tools/fuzz.py --seconds $(or $(SECONDS),60) --seed $(or $(SEED),0)
+
+# Commands killed and their disks filled at random moments, against what comes out in peace. SEED=0 ROUNDS=4.
+faults: $(BIN)/python
+	$(BIN)/pip install -q -c constraints.txt '.[test]'
+	$(BIN)/python tools/faults.py --seed $(or $(SEED),0) --rounds $(or $(ROUNDS),4)
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -389,3 +390,31 @@ def test_bad_render_arguments(tmp_path, octree_file, command, monkeypatch, argum
     code, _, err = command("render", octree_file, *arguments)
     assert code == 2 and err.startswith("nerfvol: error: ") and err.count("\n") == 1
     assert re.search(reason, err), err
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_a_video_says_which_colours_its_numbers_are(tmp_path, suffix):
+    """BT.709's matrix, stated: what a player takes by itself depends on the video's size. Read back with it, colours are those
+    of the frame to the rounding of luma and chroma and the codec's."""
+    import imageio_ffmpeg
+
+    colours = np.array([[200, 100, 50], [60, 120, 200], [40, 160, 60], [180, 60, 160]], np.uint8)
+    with pictures.open_video(tmp_path / f"v{suffix}", fps=10) as video:
+        for _ in range(3):
+            video.add(colours[None].repeat(64, 0).repeat(32, 1))
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-i", str(tmp_path / f"v{suffix}")]
+    assert re.search("tv, bt709/bt709/iec61966-2-1", subprocess.run(ffmpeg, capture_output=True, text=True).stderr)
+    # The matrix is stated to the reader, so that a tag alone does not pass.
+    as_read = [
+        "-vf",
+        "scale=in_color_matrix=bt709:in_range=tv",
+        "-pix_fmt",
+        "rgb24",
+        "-frames:v",
+        "1",
+        "-f",
+        "rawvideo",
+        "-",
+    ]
+    frame = np.frombuffer(subprocess.run([*ffmpeg, *as_read], capture_output=True).stdout, np.uint8).reshape(64, 128, 3)
+    assert np.abs(frame[32, 16::32].astype(int) - colours).max() <= 8

@@ -78,16 +78,14 @@ def model_files(model: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def _files(model: Path) -> tuple[Path, Path]:
-    files = model_files(model)
-    if files is None:
-        raise InputError(f"{model}: expected a COLMAP model, cameras and images as .bin or .txt, but there is none")
-    return files
-
-
 def images_file(model: Path) -> Path:
-    """The file of a model's images."""
-    return _files(model)[1]
+    """The file of a model's images, also where that of its cameras is missing; InputError where there is none."""
+    files = model_files(model)
+    alone = (entry(model, f"images{suffix}") for suffix in (".bin", ".txt"))
+    path = files[1] if files is not None else next((file for file in alone if file.is_file()), None)
+    if path is None:
+        raise InputError(f"{model}: expected a COLMAP model, but there is no images.bin or images.txt")
+    return path
 
 
 def points_file(model: Path) -> Path | None:
@@ -98,7 +96,10 @@ def points_file(model: Path) -> Path | None:
 
 def read_cameras(model: Path) -> dict[int, Calibration]:
     """The calibration of each camera of a model by its number; InputError where the file or a camera is unusable."""
-    path = _files(model)[0]
+    files = model_files(model)
+    if files is None:
+        raise InputError(f"{model}: expected a COLMAP model, cameras and images as .bin or .txt, but one is missing")
+    path = files[0]
     return _cameras_binary(path) if path.suffix.lower() == ".bin" else _cameras_text(path)
 
 

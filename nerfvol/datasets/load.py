@@ -71,15 +71,7 @@ def load_dataset(
     Raises:
         InputError: where the files cannot be used, in one sentence that names the file.
     """
-    if split not in SPLITS:
-        raise InputError(f"the split must be one of {', '.join(SPLITS)}, got {split!r}")
-    if not isinstance(downscale, int) or not 1 <= downscale <= 256:
-        raise InputError(f"downscale must be an integer between 1 and 256, got {downscale!r}")
-    if scene not in ("auto", *KINDS):
-        raise InputError(f"the kind of scene must be auto or one of {', '.join(KINDS)}, got {shown(scene)}")
-    box = None if aabb is None else check_box(aabb, "aabb")
-    if holdout not in HOLDOUTS:
-        raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
+    box = _checked(split, downscale, holdout, scene, aabb)
     row = find_format(Path(path))
     reader = row.reader
     listing = (
@@ -91,8 +83,7 @@ def load_dataset(
     views, training_views = views_of(frames, training, listing.source, messages, threads)
     if most is not None and len(views) > most:
         views = [views[i] for i in evenly(len(views), most)]
-    cameras = [view.camera.scaled(downscale) for view in views]
-    _require_memory(cameras, downscale)
+    _require_memory([view.camera.scaled(downscale) for view in views], downscale)
     views = with_common_masks(views, training_views, messages)
     judged, sampled = sample(training_views, threads)
     views, circles = with_circles(views, judged, messages)
@@ -103,32 +94,45 @@ def load_dataset(
     # In photographs of a place what is transparent was not seen, by whatever cut it out.
     cut_out = decision.kind != "object"
 
-    def decode() -> tuple[list[UInt8], list[UInt8 | None]]:
+    def decode(views: Sequence[View]) -> tuple[list[UInt8], list[UInt8 | None]]:
         made = map_threads(lambda view: _decoded(view, sampled.get(view.path), downscale, cut_out), views, threads)
         return _settle_alpha([image for image, _ in made], listing.source), [mask for _, mask in made]
 
     try:
-        images, masks = decode()
+        images, masks = decode(views)
     except InputError:  # found out which: once it is known that one is damaged, the time does not matter
         views = _readable(views, messages, threads)
-        cameras = [view.camera.scaled(downscale) for view in views]
-        images, masks = decode()
+        images, masks = decode(views)
     for picture in sampled.values():
         picture.take()
     if nothing := blank(views, images, messages):
-        rows = zip(views, cameras, images, masks, strict=True)
-        kept = [row for i, row in enumerate(rows) if i not in nothing]
-        views, cameras = [row[0] for row in kept], [row[1] for row in kept]
-        images, masks = [row[2] for row in kept], [row[3] for row in kept]
+        kept = [i for i in range(len(views)) if i not in nothing]
+        views, images, masks = [views[i] for i in kept], [images[i] for i in kept], [masks[i] for i in kept]
+    cameras = [view.camera.scaled(downscale) for view in views]
     require_seen(bounds, cameras)
     messages += _on_masks(views, masks, images)
-    store = ImageStore(len(images), lambda: decode()[0], images)
+    store = ImageStore(len(images), lambda: decode(views)[0], images)
     names, source = listed_names([view.frame for view in views]), str(listing.source)
     backdrop = evidence.backdrop if decision.kind == "object" and not evidence.see_through else None
     some = masks if any(mask is not None for mask in masks) else None
     return Dataset(
         cameras, store, names, bounds, source, messages, threads, listing.read_points, some, backdrop, decision.kind
     )
+
+
+def _checked(
+    split: str, downscale: int, holdout: str, scene: str, aabb: ArrayLike | None
+) -> NDArray[np.float64] | None:
+    """The aabb as two corners (2, 3), or None; InputError where an argument of load_dataset is none that it takes."""
+    if split not in SPLITS:
+        raise InputError(f"the split must be one of {', '.join(SPLITS)}, got {split!r}")
+    if not isinstance(downscale, int) or not 1 <= downscale <= 256:
+        raise InputError(f"downscale must be an integer between 1 and 256, got {downscale!r}")
+    if scene not in ("auto", *KINDS):
+        raise InputError(f"the kind of scene must be auto or one of {', '.join(KINDS)}, got {shown(scene)}")
+    if holdout not in HOLDOUTS:
+        raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
+    return None if aabb is None else check_box(aabb, "aabb")
 
 
 def _readable(views: Sequence[View], messages: list[str], threads: int | None) -> list[View]:

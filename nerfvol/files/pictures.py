@@ -101,12 +101,16 @@ def _exr_header(names: list[str], width: int, height: int) -> bytes:
     return struct.pack("<ii", 20000630, 2) + b"".join(packed) + b"\0"
 
 
-_H264 = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+_BT709 = ["-vf", "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,setparams=range=tv:colorspace=bt709:"
+          "color_primaries=bt709:color_trc=iec61966-2-1",
+          "-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1"]  # fmt: skip
+"""sRGB as players take it: of a video that states nothing they take the matrix by its size, and ffmpeg's is then the other."""
+_H264 = [*_BT709, "-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
 _PALETTE = "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer:bayer_scale=4"
 VIDEOS = {
     ".mp4": _H264,
     ".mov": _H264,
-    ".webm": ["-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0", "-row-mt", "1", "-pix_fmt", "yuv420p"],
+    ".webm": [*_BT709, "-c:v", "libvpx-vp9", "-crf", "24", "-b:v", "0", "-row-mt", "1", "-pix_fmt", "yuv420p"],
     ".gif": ["-vf", _PALETTE, "-loop", "0"],
 }
 """Ends of videos' names, and how ffmpeg encodes them."""

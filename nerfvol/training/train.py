@@ -115,7 +115,8 @@ def train(
     out = check_folder(config)
     try:
         with only_writer(out, "trains"):
-            remove_leftovers(out)
+            for folder in (out, out / run_folder.PREVIEWS):
+                remove_leftovers(folder)
             return _train(config, out, started, say, bar, watch)
     except InputError:
         with contextlib.suppress(OSError):  # a folder made for nothing; one that holds something stays

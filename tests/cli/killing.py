@@ -17,20 +17,27 @@ import nerfvol.measure.scores
 import nerfvol.training.train  # noqa: F401
 from nerfvol.cli.main import main
 
+SIGNALS = (signal.SIGKILL, signal.SIGTERM)
 
-def attempt(command: str, after: float | None, number: int) -> bool:
-    """Whether the command ended by itself and well; it is sent the signal ``number`` ``after`` so many seconds."""
+
+def attempt(command: str, after: float | None, number: int, said: str | os.PathLike[str] | None = None) -> int:
+    """The command's exit code, negative where a signal ended it; it is sent ``number`` ``after`` so many seconds.
+
+    Its errors are written to the file ``said``; by default they go where this process's go.
+    """
     child = os.fork()
     if child == 0:
         quiet = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1):
             os.dup2(quiet, stream)
+        if said is not None:
+            os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666), 2)
         os._exit(main(command.split()))
     deadline = None if after is None else time.monotonic() + after
     while True:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
-            return os.waitstatus_to_exitcode(status) == 0
+            return os.waitstatus_to_exitcode(status)
         if deadline is not None and time.monotonic() >= deadline:
             os.kill(child, number)
             deadline = None
@@ -42,7 +49,7 @@ def run() -> None:
     rng = random.Random(seed)
     begin, _, resume = " ".join(argv).partition(" --then ")
     began = time.monotonic()
-    if not attempt(begin.replace("OUT", f"{folder}/whole"), None, 0):
+    if attempt(begin.replace("OUT", f"{folder}/whole"), None, 0):
         sys.exit("the command does not end well even undisturbed")
     seconds, killed = time.monotonic() - began, 0
     for k in (1, 2):
@@ -50,7 +57,7 @@ def run() -> None:
         for left in (3, 2, 1, 0):
             command = resume if resume and Path(out, first).exists() else begin
             after = rng.uniform(0, 1.5 * seconds / left) if left else None
-            if attempt(command.replace("OUT", out), after, rng.choice((signal.SIGKILL, signal.SIGTERM))):
+            if attempt(command.replace("OUT", out), after, rng.choice(SIGNALS)) == 0:
                 break
             killed += 1
         else:

@@ -86,11 +86,9 @@ def test_transparency_and_palettes_keep_theirs(tmp_path):
 
 def test_a_png_says_its_gamma(tmp_path):
     """gAMA is the power that made values of light; sRGB's own chunk, or its own power, changes nothing."""
-    for gamma, more, expected in (
-        (1.0, (), srgb_of(COLOURS, SRGB, 1.0)),
-        (0.45455, (), COLOURS),
-        (1.0, (b"sRGB",), COLOURS),
-    ):
+    cases = ((1.0, (), srgb_of(COLOURS, SRGB, 1.0)), (0.55556, (), srgb_of(COLOURS, SRGB, 1.8)), (0.45455, (), COLOURS),
+             (1.0, (b"sRGB",), COLOURS))  # fmt: skip
+    for gamma, more, expected in cases:
         info = PngImagePlugin.PngInfo()
         info.add(b"gAMA", round(gamma * 100000).to_bytes(4, "big"))
         for chunk in more:

@@ -18,6 +18,7 @@ from nerfvol.datasets.fingerprint import changes, fingerprint
 from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
+from nerfvol.files import atomic
 from nerfvol.files.lock import only_writer
 from nerfvol.files.run_folder import OCTREE, PREVIOUS, UNFINISHED
 from nerfvol.octree.tree import Octree
@@ -119,6 +120,22 @@ def test_views_too_small_to_score_are_refused_before_the_first_step(tiny_scene, 
     code, text, err = command("train", "--data", tiny_scene, "--downscale", 4, "--out", out, "--set", "octree.steps=3")
     assert code == 2 and not out.exists() and "training" not in text
     assert "is 10x10, expected 11x11 pixels" in err and err.count("\n") == 1
+
+
+def test_what_a_killed_run_left_behind_is_swept(stopped, tmp_path, command):
+    """Its temporaries, in the folder and among the previews: it may be killed while it writes either."""
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    ).stdout.strip()
+    (run / "previews").mkdir(exist_ok=True)
+    left = [run / f"{place}.x.{gone}.{atomic._machine()}{'0' * 8}.tmp.png" for place in ("", "previews/")]
+    for path in left:
+        path.write_bytes(b"half")
+    code, _, err = command("train", "--resume", "--out", run)
+    assert code == 0, err
+    assert not any(path.exists() for path in left)
 
 
 def test_a_folder_has_one_writer(tmp_path):
