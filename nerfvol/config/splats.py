@@ -28,7 +28,7 @@ class SplatConfig(Checked):
     rate_means: Rate | None = None
     """Adam's rate of the means, in units of a Gaussian's own size. None: 0.2 in photographs, 0.25 for objects."""
     rate_scales: Rate | None = None
-    """... of the logarithms of the scales (None: 0.12 and 0.18),"""
+    """... of the logarithms of the scales (None: 0.12 and 0.16),"""
     rate_quats: Rate = 0.02
     """... of the rotations, as unit quaternions,"""
     rate_logits: Rate = 0.08
@@ -43,7 +43,7 @@ class SplatConfig(Checked):
     """... those of the means to this. None: 0.1 and 0.06."""
     beta2: Annotated[float, within(0.5, 0.99999)] | None = None
     """Memory, per step, of Adam's second moments; short, for a run on a CPU has thousands of steps, not tens of thousands.
-    None: 0.98 in photographs, 0.96 for objects."""
+    None: 0.98 in photographs, 0.97 for objects."""
     ssim: Weight | None = None
     """Weight of 1 - SSIM of 4x4 blocks next to the mean squared error. None: 0.03 in photographs, 0.02 for objects."""
     scale: Weight = 0.0
@@ -67,7 +67,7 @@ PHOTOGRAPHS: dict[str, Any] = {
     "ssim": 0.03,
 }  # fmt: skip
 OBJECTS: dict[str, Any] = {
-    "sh_degree": 2, "rate_means": 0.25, "rate_scales": 0.18, "rate_decay": 0.15, "rate_decay_means": 0.06, "beta2": 0.96,
+    "sh_degree": 2, "rate_means": 0.25, "rate_scales": 0.16, "rate_decay": 0.15, "rate_decay_means": 0.06, "beta2": 0.97,
     "ssim": 0.02,
 }  # fmt: skip
 """Settings of splats where nothing else is said."""

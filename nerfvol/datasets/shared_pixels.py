@@ -51,6 +51,6 @@ def _lent(image: Image.Image) -> NDArray[np.uint8] | None:
         return None
     memory = (ctypes.c_uint8 * size).from_address(channels.buffers[1])
     memory.owner = capsule  # type: ignore[attr-defined]  # gives the memory back when the last array on it is gone
-    out = np.frombuffer(memory, np.uint8).reshape(image.height, image.width, 4)
+    out = np.ctypeslib.as_array(memory).reshape(image.height, image.width, 4)
     out.flags.writeable = False
     return out

@@ -98,6 +98,8 @@ def test_the_table_says_on_how_many_views_each_run_was_scored():
     head, *_, first, second = ladder.table(record | {"rows": [row, row | {"n_images": 20}]}).splitlines()
     assert head.startswith("d: held-out views at 40×30;")
     assert first == "| octree | 3s | 6.5 | 14.10 | 0.7600 | 2 | 0.1 | 0.250 |" and second.split(" | ")[5] == "20"
+    several = ladder.table(record | {"rows": [row | {"psnr_of_runs": [14.1, 13.9, 15.2, 14.0]}]})
+    assert "| 14.10 (13.90 to 15.20) |" in several and "median PSNR of 4" in several
 
 
 def test_the_picture_shows_the_record():
