@@ -11,7 +11,7 @@ import numba
 import numpy as np
 import pytest
 
-from data_synth import Camera, March, Path, lights, look_at, materials, media, phase, surfaces
+from data_synth import Camera, Emission, March, Path, lights, look_at, materials, media, phase, scenes, surfaces
 from data_synth.scene import Scene
 from tests.fixtures.hypothesis_tests import assert_means, assert_sample_mean
 
@@ -213,3 +213,12 @@ def test_the_axis_of_a_ball_that_is_thinner_or_denser_than_air(ior):
     p = Path(spp=1000, jitter=False, textbook=True).render(scene, Camera(1, 1, 50.0, look_at((0, -3, 0), (0, 0, 0))))
     F, T = ((ior - 1) / (ior + 1)) ** 2, np.exp(-1.8 * SIGMA)
     assert_means(p.rgb, p.variance, F + (1 - F) ** 2 * T / (1 - F * T))
+
+
+def test_bars_of_a_slab_have_their_closed_form_and_gaps_are_clear():
+    scene = scenes.slab(sigma=2.0, height=1.0, bars=4)
+    for x, z, length in ((-0.8, -0.4, 1.5), (-0.8, -0.2, 0.0), (0.7, 0.45, 1.5), (0.95, 0.0, 0.0)):
+        picture = Emission().render(scene, Camera(1, 1, 50.0, look_at((x, -4.0, z), (x, 0.0, z))))
+        want = 1 - np.exp(-length * np.array([2.0, 1.6, 1.0]))
+        assert picture.rgb[0, 0] == pytest.approx(want * [0.9, 0.55, 0.25], abs=1e-9)
+        assert picture.alpha[0, 0] == pytest.approx(want.mean(), abs=1e-9)
