@@ -81,28 +81,46 @@ def kernel(function: Callable) -> Callable:
     return compiled
 
 
+SAY_EVERY = 10.0
+"""Seconds between two words about compiling."""
+
+
+class _Teller(event.Listener):
+    """Tells of compiling as it goes on: that it begins, every ``SAY_EVERY`` seconds how far it is, and how long it took."""
+
+    def __init__(self, out: TextIO) -> None:
+        self.out, self.started, self.ended, self.said, self.functions = out, 0.0, 0.0, 0.0, 0
+
+    def say(self, words: str) -> None:
+        print(words, file=self.out, flush=True)
+
+    def on_start(self, event: event.Event) -> None:
+        if not self.started:
+            self.started = self.said = time.perf_counter()
+            self.say("compiling for this machine, once: up to a minute ...")
+
+    def on_end(self, event: event.Event) -> None:
+        self.ended = time.perf_counter()
+        self.functions += 1
+        if self.ended - self.said >= SAY_EVERY:
+            self.said = self.ended
+            self.say(f"... {self.functions} functions after {self.ended - self.started:.0f} s")
+
+    def close(self) -> None:
+        if self.ended:
+            self.say(f"... ready after {self.ended - self.started:.0f} s; the next run finds it done")
+
+
 @contextmanager
 def say_when_compiling(stream: TextIO | None = None) -> Iterator[None]:
-    """Say on ``stream`` (stderr) that code is being compiled, once, and how long that took.
+    """Say on ``stream`` (stderr) that code is being compiled, how far that is, and how long it took.
 
     Nothing is said where the machine code is found in the cache.
     """
-    spoken: list[float] = []
-    out = stream or sys.stderr
-
-    class Listener(event.Listener):
-        def on_start(self, event: event.Event) -> None:
-            if not spoken:
-                spoken.append(time.perf_counter())
-                print("compiling for this machine, once: up to a minute ...", file=out, flush=True)
-
-        def on_end(self, event: event.Event) -> None:
-            spoken[1:] = [time.perf_counter()]
-
-    with event.install_listener("numba:compile", Listener()):
+    teller = _Teller(stream or sys.stderr)
+    with event.install_listener("numba:compile", teller):
         yield
-    if len(spoken) == 2:
-        print(f"... ready after {spoken[1] - spoken[0]:.0f} s; the next run finds it done", file=out, flush=True)
+    teller.close()
 
 
 _threads = 0

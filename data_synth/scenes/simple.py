@@ -11,11 +11,23 @@ from data_synth.cameras import Viewpoints
 from data_synth.scene import Scene
 
 
-def slab(sigma: float = 1.2, height: float = 0.6) -> Scene:
-    """homogeneous glowing slab: T = exp(-sigma length), L = (1 - T) Le"""
+def slab(sigma: float = 1.2, height: float = 0.6, bars: int = 1) -> Scene:
+    """homogeneous glowing slab: T = exp(-sigma length), L = (1 - T) Le
+
+    bars: cut into so many upright bars along x, each higher than the one before, the last one ``height``.
+    """
     medium = media.homogeneous((-1, -1, -height / 2), (1, 1, height / 2), (sigma, 0.8 * sigma, 0.5 * sigma))
+    edges = np.linspace(-1, 1, bars + 1)
+    tops = height * (np.arange(1, bars + 1) / bars - 0.5)
+    wide, deep = 0.76 * 2 / bars, min(1.0, 3 / bars)
+    cut = [
+        surfaces.box(0, (x, -deep, -height / 2), (x + wide, deep, top)) for x, top in zip(edges[:-1], tops, strict=True)
+    ]
     return Scene(
         medium=medium._replace(Le=np.array([[0.9, 0.55, 0.25]])),
+        shapes=cut if bars > 1 else [],
+        materials=[materials.null()] if bars > 1 else [],
+        bounded=bars > 1,
         viewpoints=Viewpoints(radius=4.2, elevation=(5, 60)),
         integrators=("emission", "path"),
         aabb=np.array([[-1.05, -1.05, -height], [1.05, 1.05, height]]),

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from data_synth import InputError, Path, Viewpoints, lights, media, scenes
+from data_synth import InputError, Path, Viewpoints, cli, lights, media, scenes
 from data_synth.cli import main
 from data_synth.image import Picture
 from data_synth.portrait import MARGIN, denoised, exposure_for, film, framed, portrait
@@ -105,3 +105,24 @@ def test_data_sets_are_never_denoised(tmp_path, capsys):
     assert main(["slab", "--denoise", "--out", str(tmp_path / "d")]) == 2
     assert "--picture" in capsys.readouterr().err
     assert not (tmp_path / "d").exists()
+
+
+def test_a_portrait_is_seen_from_where_one_says(monkeypatch, tmp_path, capsys):
+    seen = []
+
+    def no_picture(render, camera, *rest):
+        seen.append(camera.c2w[:3, 3])
+        return np.zeros((8, 8, 3), np.uint8)
+
+    monkeypatch.setattr(cli, "portrait", no_picture)
+    command = ["slab", "--size", "8x8", "--picture", str(tmp_path / "a.png")]
+    assert main(command) == main([*command, "--from", "20,40"]) == main([*command, "--from=-55,27.5"]) == 0
+    az, el = np.radians(20), np.radians(40)
+    assert seen[1] == pytest.approx(4.2 * np.array([np.cos(az) * np.cos(el), np.sin(az) * np.cos(el), np.sin(el)]))
+    assert seen[0] == pytest.approx(seen[2])
+    capsys.readouterr()
+    for place in ("x", "1,2,3", "0,90", "nan,3", "400,0", ""):
+        assert main([*command, f"--from={place}"]) == 2
+        assert "--from: expected azimuth and elevation" in capsys.readouterr().err
+    assert main(["slab", "--out", str(tmp_path / "d"), "--from", "20,40"]) == 2
+    assert "--from: expected --picture" in capsys.readouterr().err
