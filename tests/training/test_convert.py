@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.config.training import Config, OctreeConfig
+from nerfvol.config.octree import OctreeConfig
+from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import psnr
