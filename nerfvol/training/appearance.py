@@ -12,14 +12,14 @@ themselves before the start; only where they share too little to be compared the
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.dataset import Dataset, evenly
 from nerfvol.datasets.images import UInt8, area_average
 from nerfvol.measure.colour_fit import IDENTITY, SATURATED, apply_map, compose, exposure, fit_colour_map, inverse
 from nerfvol.starts.exposures import Exposures
@@ -33,13 +33,15 @@ fit and lose 1.1 plainly."""
 LEAST_SHOWN = 0.6
 """Share of a photograph's variance that the model must show, in the median, before exposures are asked for: fog would take the
 bright side of a thing for an exposure."""
+FIRST_ASKED = 8
+"""Photographs, evenly chosen, of which that is asked first: drawing all of them in fog would take a short run's seconds."""
 AGREEMENT = 0.6
 """Correlation of the exposures of left and right halves from which on these are the photographs' own."""
 SURE = 0.5
 """Of the spread: the most that pairs of photographs may err by for their exposures to be believed."""
 BRIGHTER = 1.02
 """Exposure of a photograph from which on its saturated pixels, which may be anything from there on, are left out."""
-FITTED_WIDTH = 60
+FITTED_WIDTH = 50
 """Pixels along the longer side that a picture has at least when its map is fitted."""
 LARGEST_FACTOR = 8
 OPAQUE = 0.999
@@ -87,6 +89,13 @@ class Appearance:
         """Fits all maps to what the model shows now; whether photographs are corrected from here on."""
         while self.rounds < len(MOMENTS) and progress >= MOMENTS[self.rounds]:
             self.rounds += 1  # a run on a clock may jump over moments
+        needs_sight = self.active or self.mode == "auto"
+        if (
+            needs_sight
+            and len(self.maps) > FIRST_ASKED
+            and not _shows_enough(seen, evenly(len(self.maps), FIRST_ASKED))
+        ):
+            return False
         fitted, halves, explained = [], [], []
         for i in range(len(self.maps)):
             photograph, shown, weight = seen(i)
@@ -96,7 +105,7 @@ class Appearance:
                 middle = photograph.shape[1] // 2
                 sides = (np.s_[:, :middle], np.s_[:, middle:])
                 halves.append([exposure(fit_colour_map(shown[s], photograph[s], weight[s])) for s in sides])
-        if (self.active or self.mode == "auto") and np.median(explained) < LEAST_SHOWN:
+        if needs_sight and np.median(explained) < LEAST_SHOWN:
             return False
         if not self.active and self.mode == "auto":
             self.decided = True
@@ -164,6 +173,13 @@ def centred(maps: NDArray[np.float64]) -> NDArray[np.float64]:
     """The maps (n, 3, 4) after one common map of the scene's colours, so that their mean is the identity."""
     undo = inverse(maps.mean(0))
     return np.stack([compose(m, undo) for m in maps])
+
+
+def _shows_enough(seen: Seen, views: Sequence[int]) -> bool:
+    """Whether the model shows enough of these views for their exposures to be asked for."""
+    asked = [seen(i) for i in views]
+    explained = [share_explained(fit_colour_map(b, a, w), b, a, w) for a, b, w in asked]
+    return bool(np.median(explained) >= LEAST_SHOWN)
 
 
 def exposures_differ(halves: NDArray[np.float64]) -> bool:

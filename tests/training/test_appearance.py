@@ -12,7 +12,7 @@ from nerfvol.measure.colour_fit import IDENTITY, apply_map, compose, exposure, f
 from nerfvol.native import native
 from nerfvol.starts.exposures import Exposures
 from nerfvol.training import train
-from nerfvol.training.appearance import MOMENTS, Appearance, centred
+from nerfvol.training.appearance import FIRST_ASKED, MOMENTS, Appearance, centred
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.fixtures.runs import metrics_of, settings, start
 
@@ -96,11 +96,15 @@ def test_fog_takes_no_bright_side_for_an_exposure():
     """A grey model says nothing of why photographs differ; the question is asked again once it shows something."""
     scene = np.random.default_rng(0).uniform(0, 0.7, (20, 30, 3))
 
+    asked = []
+
     def fog(i):
+        asked.append(i)
         return GAINS[i] * scene, np.full_like(scene, 0.35), np.ones(scene.shape[:2])
 
     appearance = Appearance(12)
     assert not appearance.fit(fog, MOMENTS[0]) and not appearance.decided and appearance.due(MOMENTS[1])
+    assert len(asked) == FIRST_ASKED  # each is a picture of fog, which is slow to draw
     assert appearance.fit(seen_with(GAINS, scene), MOMENTS[1])
 
 
