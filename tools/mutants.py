@@ -139,7 +139,7 @@ MUTANTS = (
     M("nerfvol/rotations.py", "[2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]", "[2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]", "cameras/test_paths.py::test_quaternions", "a sign in a rotation"),
     M("nerfvol/sh.py", "values += [-_C1 * y, _C1 * z, -_C1 * x]", "values += [-_C1 * y, _C1 * z, _C1 * x]", "test_sh.py", "a sign of the first band"),
     M("nerfvol/measure/metrics.py", "_K1, _K2 = 0.01, 0.03", "_K1, _K2 = 0.01, 0.01", "measure/test_metrics.py", "the constant of SSIM's contrast"),
-    M("nerfvol/measure/metrics.py", "_ssim_where(np.where(seen[..., None], a, b), b, seen)", "_ssim_where(a, b, seen)", "measure/test_metrics.py " + MASKS, "masked pixels in SSIM's windows"),
+    M("nerfvol/measure/metrics.py", "_similarities(np.where(seen[..., None], a, b), b)", "_similarities(a, b)", "measure/test_metrics.py " + MASKS, "masked pixels in SSIM's windows"),
     M("nerfvol/measure/truth.py", "np.where(corner, place - low, 1 - (place - low))", "np.where(corner, 1 - (place - low), place - low)", "measure/test_truth.py", "trilinear weights the other way round"),
     M("nerfvol/measure/colour_fit.py", "w *= (t < SATURATED).all(1)", "w *= (t < 2).all(1)", "training/test_appearance.py", "saturated pixels in colour maps"),
     M("nerfvol/measure/colour_fit.py", "np.concatenate([np.diag(gain), np.zeros((3, 1))], axis=1)", "np.eye(3, 4)", "training/test_appearance.py", "maps that fall back to no gain"),

@@ -36,13 +36,12 @@ def on_cpu_clock(argv: list[str]) -> None:
     import time
 
     import nerfvol.machine
-    import nerfvol.training.session
 
     def clock() -> float:
         return time.process_time() / BUSY
 
     time.perf_counter = clock
-    nerfvol.machine.process_seconds = nerfvol.training.session.process_seconds = clock
+    nerfvol.machine.process_seconds = clock  # before anything takes it from there
     sys.argv = ["nerfvol", *argv]
     runpy.run_module("nerfvol", run_name="__main__")
 
