@@ -56,9 +56,11 @@ MUTANTS = (
     M("nerfvol/cameras/focus.py", "kept = _agreeing(across, origins)", "kept = np.ones(len(origins), dtype=bool)", PEOPLE, "one axis moves the point that all look at"),
     M("nerfvol/cameras/calibration.py", "fx = self.fx * sx if", "fx = self.fx if", PEOPLE, "the focal length of resized pictures"),
     # ---------------------------------------------------------------- datasets
-    M("nerfvol/datasets/colours.py", "gamma=1 / gamma)", "gamma=gamma)", "datasets/test_colours.py", "a PNG's gamma the wrong way round"),
+    M("nerfvol/datasets/colours.py", "known = 1 / gamma if", "known = gamma if", "datasets/test_colours.py", "a PNG's gamma the wrong way round"),
     M("nerfvol/datasets/colours.py", "light[rows] @ _ADOBE.T", "light[rows] @ _ADOBE", "datasets/test_colours.py", "Adobe RGB's primaries transposed"),
-    M("nerfvol/datasets/colours.py", "if _space(profile) == \"RGB\" and _is_srgb(profile):", "if False:", "datasets/test_colours.py", "sRGB's own profile changes bits"),
+    M("nerfvol/datasets/colours.py", "made.putalpha(whole.getchannel(\"A\"))", "pass", "datasets/test_colours.py", "grey with a profile loses its transparency"),
+    M("nerfvol/datasets/images.py", "_pixels(image, path, as_stored=True)", "_pixels(image, path)", "datasets/test_colours.py", "masks are converted as colours are"),
+    M("nerfvol/datasets/colours.py", "if _space(profile) in (\"RGB\", \"GRAY\") and _is_srgb(profile):", "if False:", "datasets/test_colours.py", "sRGB's own profile changes bits"),
     M("nerfvol/datasets/bounds.py", "0.5 * hint.aabb_scale / hint.unit", "0.5 * hint.aabb_scale / INSTANT_NGP_SCALE", "datasets/test_habits.py", "aabb_scale in units that the file does not state"),
     M("nerfvol/datasets/kinds.py", "opencv = inverse.ahead <= LOOKS_AWAY and not looks_away", "opencv = False", "datasets/test_habits.py", "world-to-camera matrices in OpenCV axes are not suspected"),
     M("nerfvol/cameras/calibration.py", "\"cx\": matrix[0, 2], \"cy\": matrix[1, 2]}", "\"cx\": matrix[1, 2], \"cy\": matrix[0, 2]}", "datasets/test_habits.py", "a matrix's principal point turned over"),

@@ -18,6 +18,8 @@ from PIL import Image
 SAME = 2
 """Levels of 255 by which a profile's colours may differ from sRGB's and still be those: profiles are rounded."""
 _PNG_GAMMA, _NEAR = 1 / 2.2, 0.03
+_GAMMAS = (0.1, 10)
+"""Beyond which a PNG's gamma is a mistake: it would make pictures black or white."""
 _ADOBE = np.array([[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292933, 1.04292933]], np.float32)
 """Linear Adobe RGB (1998) to linear sRGB: both have D65's white and, but for green, the same primaries."""
 _ADOBE_GAMMA = 2.19921875
@@ -68,7 +70,8 @@ def colours_of(image: Image.Image) -> Colours | None:
         return _of_profile(profile, image.mode)
     gamma = image.info.get("gamma")
     if image.format == "PNG" and isinstance(gamma, float) and gamma > 0 and "srgb" not in image.info:
-        return None if abs(gamma - _PNG_GAMMA) < _NEAR else Colours(f"a gamma of {gamma:.3g}", gamma=1 / gamma)
+        known = 1 / gamma if _GAMMAS[0] <= gamma <= _GAMMAS[1] else None
+        return None if abs(gamma - _PNG_GAMMA) < _NEAR else Colours(f"a gamma of {gamma:.3g}", gamma=known)
     if image.format in ("JPEG", "MPO") and "exif" in image.info and _says_adobe(image):
         return Colours("Adobe RGB, by EXIF", gamma=_ADOBE_GAMMA, is_adobe=True)
     return Colours("inks (CMYK) without a profile") if image.mode == "CMYK" else None
@@ -101,13 +104,13 @@ def _of_profile(profile: bytes, mode: str) -> Colours | None:
     from PIL import ImageCms
 
     try:
-        name = (ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile))).strip() or "unnamed")[:60]
-        if _space(profile) == "RGB" and _is_srgb(profile):
-            return None
+        said = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(profile)))
         _transform(profile, _for_profile(Image.new(mode, (1, 1)), profile).mode)
+        if _space(profile) in ("RGB", "GRAY") and _is_srgb(profile):
+            return None
     except Exception:  # whatever lcms makes of damaged bytes, or of a profile for other numbers than the picture's
         return Colours("a colour profile that cannot be used")
-    return Colours(name, profile)
+    return Colours(" ".join(said.split())[:60] or "unnamed", profile)
 
 
 @functools.lru_cache(maxsize=64)
@@ -122,8 +125,10 @@ def _space(profile: bytes) -> str:
 def _is_srgb(profile: bytes) -> bool:
     steps = np.linspace(0, 255, 6).round().astype(np.uint8)
     grid = np.stack(np.meshgrid(steps, steps, steps), -1).reshape(6, -1, 3)
+    if _space(profile) == "GRAY":
+        grid = np.arange(256, dtype=np.uint8)[None]
     found = np.asarray(_by_profile(profile, Image.fromarray(grid))).astype(int)
-    return bool(np.abs(found - grid).max() <= SAME)
+    return bool(np.abs(found - np.atleast_3d(grid)).max() <= SAME)
 
 
 def _by_profile(profile: bytes, image: Image.Image) -> Image.Image:
@@ -132,8 +137,8 @@ def _by_profile(profile: bytes, image: Image.Image) -> Image.Image:
     ready = _for_profile(image, profile)
     made = ImageCms.applyTransform(ready, _transform(profile, ready.mode))
     assert made is not None
-    if image.mode in ("LA", "PA") and ready.mode == "L":  # grey profiles have no alpha of their own
-        made.putalpha(image.getchannel("A"))
+    if ready.mode == "L" and (whole := _plain(image)).mode == "RGBA":  # grey profiles have no alpha of their own
+        made.putalpha(whole.getchannel("A"))
     return made
 
 

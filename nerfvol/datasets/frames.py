@@ -210,14 +210,14 @@ def _may_lie(view: View, header: ImageHeader) -> bool:
 
 def _on_files(views: Sequence[View], headers: dict[int, ImageHeader]) -> list[str]:
     """Sentences on pictures that are not what a file of this name usually is: in other colours, or several in one."""
-    said, by_name = [], {}
+    said, by_name = [], {}  # by name alone: some programs write the moment into each profile
     for view in views:
         colours = headers[id(view.frame)].colours
         if colours is not None:
-            by_name.setdefault(colours, []).append(view.frame.listed)
-    for colours, names in by_name.items():
-        done = "they are converted to it" if colours.is_known else "they are taken as if they were sRGB's"
-        said.append(f"{len(names)} of {len(views)} images state other colours than sRGB ({colours.name}): {done}")
+            by_name.setdefault((colours.name, colours.is_known), []).append(view.frame.listed)
+    for (name, is_known), names in by_name.items():
+        done = "they are converted to it" if is_known else "they are taken as if they were sRGB's"
+        said.append(f"{len(names)} of {len(views)} images state other colours than sRGB ({name}): {done}")
     if several := [view.frame.listed for view in views if headers[id(view.frame)].pictures > 1]:
         said.append(
             f"{len(several)} of {len(views)} images are files of several pictures, animations or pages: the first of each is "

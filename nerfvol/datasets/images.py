@@ -216,7 +216,10 @@ def read_mask(path: Path, size: tuple[int, int], orientation: int = 1) -> UInt8:
         InputError: as for read_image, or a mask of another shape.
     """
     with _opened(path) as image:
-        pixels, darkest = _pixels(image, path), 127 if image.format == "JPEG" else 0  # JPEG's black is a little noisy
+        pixels, darkest = (
+            _pixels(image, path, as_stored=True),
+            127 if image.format == "JPEG" else 0,
+        )  # JPEG's black is a little noisy
     values = pixels[..., :3].max(axis=2)
     if pixels.shape[2] == 4:
         values = pixels[..., 3] if values.min() == values.max() else np.minimum(values, pixels[..., 3])
@@ -236,14 +239,15 @@ def _is_misread(image: Image.Image) -> bool:
     return tags.get(_TIFF_PLANES) == 2 and max(tags.get(_TIFF_BITS, (8,))) > 8
 
 
-def _pixels(image: Image.Image, path: Path) -> UInt8:
+def _pixels(image: Image.Image, path: Path, as_stored: bool = False) -> UInt8:
+    """``as_stored``: whatever colours the file states, as for numbers that are none."""
     if image.mode == "F" or (image.mode == "I" and image.format != "PNG"):
         raise InputError(f"{path}: expected 8 or 16 bits a channel, got 32-bit pixels (mode {image.mode})")
     if image.format == "TIFF" and _is_misread(image):
         raise InputError(f"{path}: a TIFF of 16 bits with a plane for each colour is not read: save it as PNG")
-    colours = colours_of(image)
+    colours = None if as_stored else colours_of(image)
     if colours is not None and colours.is_known:
-        return np.asarray(colours.to_srgb(image))
+        return pixels_of(colours.to_srgb(image))
     if image.mode.startswith("I"):
         return np.repeat(eight_bits(image)[..., None], 3, axis=2)
     has_alpha = image.mode in _ALPHA_MODES or "transparency" in image.info

@@ -24,24 +24,54 @@ COLOURS = np.array(
 )
 
 
-def profile(primaries, gamma, name) -> bytes:
-    """An ICC version 2 profile of primaries (3, 3), D50, and a power, written out by hand (ICC.1:2001-04)."""
-
-    def numbers(values):
-        return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(v * 65536) for v in values))
-
-    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256))
+def icc(space, tags, name, connection=b"XYZ ", kind=b"mntr") -> bytes:
+    """An ICC version 2 profile written out by hand (ICC.1:2001-04)."""
     tags = {b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(name) + 1) + name.encode() + bytes(79),
-            b"wtpt": numbers((0.9642, 1, 0.8249)), b"cprt": b"text\0\0\0\0\0"}  # fmt: skip
-    for letter, column in zip("rgb", primaries.T, strict=True):
-        tags |= {f"{letter}XYZ".encode(): numbers(column), f"{letter}TRC".encode(): curve}
+            b"wtpt": numbers((0.9642, 1, 0.8249)), b"cprt": b"text\0\0\0\0\0", **tags}  # fmt: skip
     table, body, first = struct.pack(">I", len(tags)), b"", 128 + 4 + 12 * len(tags)
     for tag, data in tags.items():
         table += tag + struct.pack(">II", first + len(body), len(data))
         body += data + bytes(-len(data) % 4)
-    head = struct.pack(">I4sI4s4s4s", first + len(body), b"lcms", 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    head = struct.pack(">I4sI4s4s4s", first + len(body), b"lcms", 0x02100000, kind, space, connection)
     head += bytes(12) + b"acsp" + bytes(28) + struct.pack(">3i", 63190, 65536, 54061) + bytes(48)
     return head + table + body
+
+
+def numbers(values) -> bytes:
+    return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(v * 65536) for v in values))
+
+
+def curve(values) -> bytes:
+    """Of a power, or of what 0 to 1 become."""
+    whole = [round(values * 256)] if np.isscalar(values) else [round(v * 65535) for v in values]
+    return b"curv\0\0\0\0" + struct.pack(f">I{len(whole)}H", len(whole), *whole)
+
+
+def profile(primaries, gamma, name) -> bytes:
+    """Of primaries (3, 3), D50, and a power."""
+    tags = {}
+    for letter, column in zip("rgb", primaries.T, strict=True):
+        tags |= {f"{letter}XYZ".encode(): numbers(column), f"{letter}TRC".encode(): curve(gamma)}
+    return icc(b"RGB ", tags, name)
+
+
+def grey(values, name="grey") -> bytes:
+    return icc(b"GRAY", {b"kTRC": curve(values)}, name)
+
+
+def inks() -> bytes:
+    """White paper, black where K is full or all others are, cyan at its corner; in between linear in Lab."""
+    corners = np.zeros((2, 2, 2, 2, 3), np.uint8) + 128
+    share = np.stack(np.meshgrid(*[[0, 1]] * 4, indexing="ij"), -1)
+    corners[..., 0] = np.rint(255 * (1 - share[..., 3]) * (1 - share[..., :3].mean(axis=-1)))
+    corners[1, 0, 0, 0] = np.rint([CYAN[0] * 2.55, CYAN[1] + 128, CYAN[2] + 128])
+    table = b"mft1\0\0\0\0" + bytes([4, 3, 2, 0]) + struct.pack(">9i", *(65536 * np.eye(3, dtype=int)).ravel())
+    table += bytes(range(256)) * 4 + corners.tobytes() + bytes(range(256)) * 3
+    return icc(b"CMYK", {b"A2B0": table, b"A2B1": table}, "inks", b"Lab ", b"prtr")
+
+
+CYAN = (60, -30, -30)
+"""In Lab."""
 
 
 def srgb_of(values, primaries, gamma):
@@ -121,10 +151,69 @@ def test_cameras_mark_adobe_rgb_in_exif(tmp_path):
     assert (read_image(tmp_path / "b.jpg") == plain).all()
 
 
+def test_grey_profiles(tmp_path):
+    """Of any curve but sRGB's own; a transparent level and half-transparent pixels stay as transparent as they were."""
+    plain = Image.fromarray(COLOURS).convert("L")
+    values, alpha = np.asarray(plain), (np.arange(6, dtype=np.uint8) * 40)[None]
+    expected = srgb_of(np.repeat(values[..., None], 3, axis=2), SRGB, 1.8)
+    plain.save(tmp_path / "a.png", icc_profile=grey(1.8))
+    assert np.abs(read_image(tmp_path / "a.png") - expected).max() <= 2
+    level = int(values[0, 1])
+    plain.save(tmp_path / "t.png", icc_profile=grey(1.8), transparency=level)
+    image = read_image(tmp_path / "t.png")
+    assert (image[..., 3] == np.where(values == level, 0, 255)).all() and np.abs(image[..., :3] - expected).max() <= 2
+    Image.merge("LA", (plain, Image.fromarray(alpha))).save(tmp_path / "b.png", icc_profile=grey(1.8))
+    image = read_image(tmp_path / "b.png")
+    assert (image[..., 3] == alpha).all() and np.abs(image[..., :3] - expected).max() <= 2
+    x = np.linspace(0, 1, 1024)
+    own = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    plain.save(tmp_path / "s.png", icc_profile=grey(own, "sGray"))
+    assert (read_image(tmp_path / "s.png") == values[..., None]).all()
+    with Image.open(tmp_path / "s.png") as image:
+        assert colours_of(image) is None
+
+
+def test_inks_with_a_profile(tmp_path):
+    """No ink, all black, and cyan alone; ICC.1's Lab is relative to D50."""
+    ink = np.array([[[0, 0, 0, 0], [0, 0, 0, 255], [255, 0, 0, 0]]], np.uint8)
+    Image.fromarray(ink, "CMYK").save(tmp_path / "a.tif", icc_profile=inks())
+    f = (CYAN[0] + 16) / 116 + np.array([CYAN[1] / 500, 0, -CYAN[2] / 200])
+    light = np.linalg.inv(SRGB) @ (np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29)) * (0.9642, 1, 0.8249))
+    light = np.clip(light, 0, 1)
+    cyan = 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    # 8 bits of Lab are half a level of L, and more of what they stand for in red, which is near 0.
+    assert np.abs(read_image(tmp_path / "a.tif") - np.stack([[255] * 3, [0] * 3, cyan])).max() <= 4
+
+
+def test_a_profile_of_other_numbers_than_the_pictures_is_told(tmp_path):
+    """Inks with sRGB's own profile are no sRGB."""
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(COLOURS).convert("CMYK").save(tmp_path / "a.tif", icc_profile=own)
+    with Image.open(tmp_path / "a.tif") as image:
+        colours = colours_of(image)
+    assert colours is not None and not colours.is_known
+
+
+@pytest.mark.parametrize("gamma", [1, 4_000_000_000])
+def test_a_gamma_that_none_can_mean_is_not_applied(tmp_path, gamma):
+    info = PngImagePlugin.PngInfo()
+    info.add(b"gAMA", gamma.to_bytes(4, "big"))
+    assert (read_image(save(tmp_path / "a.png", pnginfo=info)) == COLOURS).all()
+    with Image.open(tmp_path / "a.png") as image:
+        colours = colours_of(image)
+    assert colours is not None and not colours.is_known and "gamma" in colours.name
+
+
 def test_masks_stay_black_and_white(tmp_path):
     mask = np.repeat(np.where(np.arange(6) % 2, 255, 0).astype(np.uint8)[None, :, None], 3, axis=2)
     Image.fromarray(mask).save(tmp_path / "m.png", icc_profile=profile(P3, 2.2, "P3"))
     assert (read_mask(tmp_path / "m.png", (6, 1)) == mask[..., 0]).all()
+
+
+def test_a_masks_numbers_are_no_colours(tmp_path):
+    """What is darker than half is left out of a JPEG, whatever light a profile says it is."""
+    Image.new("L", (16, 16), 120).save(tmp_path / "m.jpg", icc_profile=grey(1.0))
+    assert read_image(tmp_path / "m.jpg").min() > 127 and not read_mask(tmp_path / "m.jpg", (16, 16)).any()
 
 
 # ------------------------------------------------------------------ what a set says of it
@@ -145,6 +234,16 @@ def again(folder, **more):
 ])  # fmt: skip
 def test_a_set_in_other_colours_says_so(tmp_path, more, words):
     said(load_dataset(again(scene(tmp_path), **more)), *words)
+
+
+def test_profiles_of_one_name_are_one_sentence(tmp_path):
+    """As of programs that write a profile for each picture; and its name is one line."""
+    scene(tmp_path)
+    for k, path in enumerate(sorted((tmp_path / "images").iterdir())):
+        with Image.open(path) as image:
+            image.load()
+        image.save(path, icc_profile=profile(P3, 1.8 + 0.02 * k, "My\nscreen"))
+    said(load_dataset(tmp_path), "10 of 10 images", "(My screen)")
 
 
 def test_inks_without_a_profile_are_told(tmp_path):
