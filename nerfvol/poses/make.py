@@ -148,9 +148,10 @@ def gather(
         sharp = float(np.median(judged.sharpness[chosen]))
         messages.append(f"{len(chosen)} of {n} frames are taken: the sharpest of each part in which something moves")
         if video.is_high_range(path):
-            messages.append(
-                "the video has a high dynamic range (HLG or PQ): its frames are converted to an ordinary one (BT.709)"
-            )
+            done = "its frames are converted to an ordinary one (BT.709)"
+            if not video.converts_high_range():
+                done = "its frames look pale, since this ffmpeg has no filter zscale to convert them"
+            messages.append(f"the video has a high dynamic range (HLG or PQ): {done}")
         record: dict[str, Any] = {"frames": n, "chosen": chosen, "sharpness": sharp}
     else:
         paths = sources.find_photographs(path)

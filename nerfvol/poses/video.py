@@ -6,6 +6,7 @@ Two passes through ffmpeg: small grey frames to judge, then the chosen ones at f
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import re
 import subprocess
@@ -82,7 +83,9 @@ def write_frames(path: Path, chosen: list[int], folder: Path, size: int) -> list
     names = [f"frame_{number:05d}.jpg" for number in chosen]
     with tempfile.TemporaryDirectory(dir=folder, prefix=".frames") as temporary:
         select = _any_of(chosen)
-        colours = _TO_ORDINARY_RANGE if is_high_range(path) else ":out_color_matrix=bt601"  # which is JPEG's matrix
+        colours = ":out_color_matrix=bt601"  # which is JPEG's matrix
+        if converts_high_range() and (stated := _high_range(path)):
+            colours = (_AS_BT2020 if "unknown" in stated else "") + _TO_ORDINARY_RANGE
         fit = f"scale='min({size},iw)':'min({size},ih)':force_original_aspect_ratio=decrease:flags=lanczos"
         out = ["-fps_mode", "passthrough", "-q:v", "2", "-f", "image2", str(Path(temporary) / "%05d.jpg")]
         result = subprocess.run(
@@ -106,11 +109,31 @@ _TO_ORDINARY_RANGE = (
 is brighter compressed."""
 
 
+_AS_BT2020 = ",setparams=color_primaries=bt2020:colorspace=bt2020nc"
+"""For videos that say their curve and leave the rest open, which zscale refuses: HLG and PQ are BT.2100's, of these colours."""
+
+
 def is_high_range(path: Path) -> bool:
     """Whether a video has the high dynamic range that phones record (HLG, PQ), whose numbers taken as they are look pale."""
+    return bool(_high_range(path))
+
+
+def _high_range(path: Path) -> str:
+    """What a video of a high dynamic range states, matrix/primaries/curve; empty where it is an ordinary one."""
     header = subprocess.run([*_ffmpeg(path)[:-4], "-loglevel", "info", *_ffmpeg(path)[-4:]], capture_output=True,
                             stdin=subprocess.DEVNULL).stderr  # fmt: skip
-    return re.search(rb"Stream #0:\d+.*Video:.*(arib-std-b67|smpte2084)", header) is not None
+    found = re.search(rb"Stream #0:\d+.*Video:.*?([\w-]+/[\w-]+/(?:arib-std-b67|smpte2084))", header)
+    return "" if found is None else found[1].decode()
+
+
+@functools.cache
+def converts_high_range() -> bool:
+    """Whether this ffmpeg has the filter that converts a high range: some are built without the zimg library."""
+    import imageio_ffmpeg
+
+    asked = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-filters"], capture_output=True,
+                           stdin=subprocess.DEVNULL)  # fmt: skip
+    return b" zscale " in asked.stdout
 
 
 def _any_of(numbers: Sequence[int]) -> str:

@@ -43,7 +43,7 @@ def numbers(values) -> bytes:
 
 def curve(values) -> bytes:
     """Of a power, or of what 0 to 1 become."""
-    whole = [round(values * 256)] if np.isscalar(values) else [round(v * 65535) for v in values]
+    whole = [round(256 * values)] if isinstance(values, float) else [round(65535 * v) for v in values]
     return b"curv\0\0\0\0" + struct.pack(f">I{len(whole)}H", len(whole), *whole)
 
 
@@ -51,7 +51,7 @@ def profile(primaries, gamma, name) -> bytes:
     """Of primaries (3, 3), D50, and a power."""
     tags = {}
     for letter, column in zip("rgb", primaries.T, strict=True):
-        tags |= {f"{letter}XYZ".encode(): numbers(column), f"{letter}TRC".encode(): curve(gamma)}
+        tags |= {f"{letter}XYZ".encode(): numbers(column), f"{letter}TRC".encode(): curve(float(gamma))}
     return icc(b"RGB ", tags, name)
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 from nerfvol.errors import InputError
 from nerfvol.files.pictures import open_video
 from nerfvol.measure.sharpness import sharpness
+from nerfvol.poses import video as videos
 from nerfvol.poses.video import Judged, choose_frames, is_high_range, judge_video, write_frames
 
 
@@ -140,9 +141,27 @@ def test_frames_have_the_videos_colours(tmp_path, matrix):
     assert np.abs(stripes(tmp_path, video) - COLOURS).max() <= 6
 
 
+needs_zscale = pytest.mark.skipif(
+    not videos.converts_high_range(), reason="an ffmpeg without zscale makes no HDR video"
+)
+
+
+@needs_zscale
 @pytest.mark.parametrize("curve", ["arib-std-b67", "smpte2084"])
-def test_videos_of_a_high_range_are_no_paler_than_others(tmp_path, curve):
-    """Bright colours are compressed by the mapping, to about a tenth less; taken as they are these are 60 levels off."""
-    video = coloured(tmp_path, HIGH.format(curve), "bt2020", curve, "bt2020nc")
+@pytest.mark.parametrize("others", ["bt2020", "unknown"])
+def test_videos_of_a_high_range_are_no_paler_than_others(tmp_path, curve, others):
+    """Bright colours are compressed by the mapping, to about a tenth less; taken as they are these are 60 levels off. Some
+    programs state the curve alone."""
+    matrix = others.replace("bt2020", "bt2020nc")
+    filters = f"{HIGH.format(curve)},setparams=colorspace={matrix}:color_primaries={others}"
+    video = coloured(tmp_path, filters, others, curve, matrix)
     assert is_high_range(video)
     assert np.abs(stripes(tmp_path, video) - COLOURS).max() <= 16
+
+
+@needs_zscale
+def test_an_ffmpeg_without_the_filter_gives_pale_frames(tmp_path, monkeypatch):
+    video = coloured(tmp_path, HIGH.format("arib-std-b67"), "bt2020", "arib-std-b67", "bt2020nc")
+    monkeypatch.setattr(videos, "converts_high_range", lambda: False)
+    monkeypatch.setattr(videos, "_TO_ORDINARY_RANGE", ",nosuchfilter")
+    assert stripes(tmp_path, video).shape == COLOURS.shape
