@@ -218,7 +218,7 @@ def _on_files(views: Sequence[View], headers: dict[int, ImageHeader]) -> list[st
     for (name, is_known), names in by_name.items():
         done = "they are converted to it" if is_known else "they are taken as if they were sRGB's"
         said.append(f"{len(names)} of {len(views)} images state other colours than sRGB ({name}): {done}")
-    if several := [view.frame.listed for view in views if headers[id(view.frame)].pictures > 1]:
+    if several := [view.frame.listed for view in views if headers[id(view.frame)].is_several]:
         said.append(
             f"{len(several)} of {len(views)} images are files of several pictures, animations or pages: the first of each is "
             f"used: {named(several)}"

@@ -113,12 +113,12 @@ def _looks_like(path: Path) -> str:
 @dataclass(frozen=True)
 class ImageHeader:
     """``size``: (width, height) in pixels as stored. ``orientation``: EXIF's, 1 to 8; 1: as stored. ``colours``: those that
-    it states instead of sRGB's. ``pictures``: how many the file holds, of which the first counts."""
+    it states instead of sRGB's. ``is_several``: others follow in the file, which do not count."""
 
     size: tuple[int, int]
     orientation: int
     colours: Colours | None = None
-    pictures: int = 1
+    is_several: bool = False
 
     @property
     def upright(self) -> tuple[int, int]:
@@ -133,9 +133,10 @@ def image_header(path: Path) -> ImageHeader:
     with _opened(path) as image:
         orientation = _exif(image, path).get(_EXIF_ORIENTATION, 1)
         known = type(orientation) is int and 1 <= orientation <= 8
-        several = image.format != "MPO"  # what phones write behind a photograph is a map of its brightness
-        pictures = getattr(image, "n_frames", 1) if several else 1
-        return ImageHeader(image.size, orientation if known else 1, colours_of(image), pictures)
+        # What phones write behind a photograph, MPO, is a map of its brightness. Others are not counted: that would read
+        # them, with all that is wrong with them, and leave what they state in image.info.
+        several = image.format != "MPO" and getattr(image, "is_animated", False)
+        return ImageHeader(image.size, orientation if known else 1, colours_of(image), several)
 
 
 def _exif(image: Image.Image, path: Path) -> Image.Exif:

@@ -6,10 +6,10 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import Image, ImageCms, PngImagePlugin
+from PIL import Image, ImageCms, PngImagePlugin, TiffImagePlugin
 
 from nerfvol.datasets.colours import colours_of
-from nerfvol.datasets.images import read_image, read_mask
+from nerfvol.datasets.images import image_header, read_image, read_mask
 from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from tests.datasets.test_whatever_people_bring import said, scene
@@ -253,6 +253,23 @@ def test_inks_without_a_profile_are_told(tmp_path):
         Image.open(path).convert("CMYK").save(buffer, "JPEG")
         path.write_bytes(buffer.getvalue())
     said(load_dataset(tmp_path), "inks (CMYK)", "as if they were sRGB's")
+
+
+def test_what_follows_the_first_picture_of_a_tiff_does_not_decide(tmp_path):
+    """Neither another page's profile, nor that its place in the file is nonsense."""
+    with TiffImagePlugin.AppendingTiffWriter(str(tmp_path / "a.tif"), True) as file:
+        for more in ({}, {"icc_profile": profile(P3, 2.2, "P3")}):
+            Image.fromarray(COLOURS).save(file, format="TIFF", **more)
+            file.newFrame()
+    header = image_header(tmp_path / "a.tif")
+    assert header.is_several and header.colours is None and (read_image(tmp_path / "a.tif") == COLOURS).all()
+    data = bytearray(save(tmp_path / "b.tif").read_bytes())
+    (first,) = struct.unpack("<I", data[4:8])
+    (entries,) = struct.unpack("<H", data[first : first + 2])
+    after = first + 2 + 12 * entries
+    data[after : after + 4] = struct.pack("<I", 20)
+    (tmp_path / "b.tif").write_bytes(data)
+    assert image_header(tmp_path / "b.tif").size == (6, 1)
 
 
 def test_planes_of_sixteen_bits_are_refused(tmp_path):
