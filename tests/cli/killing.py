@@ -10,6 +10,7 @@ import random
 import signal
 import sys
 import time
+import traceback
 from pathlib import Path
 
 import data_synth.cli  # noqa: F401  # what the commands import
@@ -27,12 +28,18 @@ def attempt(command: str, after: float | None, number: int, said: str | os.PathL
     """
     child = os.fork()
     if child == 0:
-        quiet = os.open(os.devnull, os.O_RDWR)
-        for stream in (0, 1):
-            os.dup2(quiet, stream)
-        if said is not None:
-            os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666), 2)
-        os._exit(main(command.split()))
+        code = 70  # as of a fault within a program
+        try:
+            quiet = os.open(os.devnull, os.O_RDWR)
+            for stream in (0, 1):
+                os.dup2(quiet, stream)
+            if said is not None:
+                os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666), 2)
+            code = main(command.split())
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)  # whatever came: a child that went on would tidy up what is its parent's
     deadline = None if after is None else time.monotonic() + after
     while True:
         ended, status = os.waitpid(child, os.WNOHANG)
