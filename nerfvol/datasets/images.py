@@ -67,7 +67,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except FileNotFoundError as error:
         raise InputError(f"{path}: expected an image, but there is no such file") from error
     except UnidentifiedImageError as error:
-        raise InputError(f"{path}: expected a {_OR} image, but its content is {_looks_like(path)}") from error
+        raise InputError(f"{path}: expected a {_OR} image, but its content is {looks_like(path)}") from error
     except OSError as error:
         raise InputError(f"{path}: the image cannot be read: {explain_os_error(error)}") from error
     except Exception as error:  # decoders raise whatever damaged bytes bring them to
@@ -90,7 +90,7 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [""])[0][:80] or type(error).__name__
 
 
-def _looks_like(path: Path) -> str:
+def looks_like(path: Path) -> str:
     """What a file that is no known picture begins like."""
     try:
         with path.open("rb") as file:

@@ -81,8 +81,9 @@ def _registered(folder: Path, images: Path, names: list[str], count: int) -> tup
         return one, [f"{images.name} holds each photograph as {named(sorted({Path(n).suffix for n in names}))}: "
                      f"{Path(one[0]).suffix} is used"]  # fmt: skip
     wrong = f"{folder / POSES}: holds {count} poses, but {images.name} holds {len(names)} images"
-    models = [folder / "sparse" / "0", folder / "sparse"]
-    model = next((m for m in models if any((m / f"images{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
+    sparse, names_of = entry(folder, "sparse"), ("images.bin", "images.txt")
+    models = [entry(sparse, "0"), sparse]
+    model = next((m for m in models if any(entry(m, name).is_file() for name in names_of)), None)
     if model is None:
         raise InputError(
             f"{wrong}, so that which pose is whose is not known; take out the images that structure from motion left out, or "

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 
 from nerfvol.datasets.colours import colours_of
-from nerfvol.datasets.images import FORMATS, MAX_PIXELS, SUFFIXES, map_threads
+from nerfvol.datasets.images import FORMATS, MAX_PIXELS, SUFFIXES, looks_like, map_threads
 from nerfvol.datasets.listing import is_left_aside
 from nerfvol.errors import InputError
 from nerfvol.files.atomic import atomic_write
@@ -131,6 +131,8 @@ def copy_photographs(paths: list[Path], folder: Path, size: int) -> tuple[list[P
     def copy(pair: tuple[Path, str]) -> Photograph | str:
         try:
             return _copy(pair[0], folder, pair[1], size)
+        except UnidentifiedImageError:  # says the path alone
+            return f"{pair[0].name} is left out: it cannot be read (its content is {looks_like(pair[0])})"
         except Exception as error:  # a decoder fails in as many ways as files are damaged
             with_suffix = str(error).splitlines()[0] if str(error) else type(error).__name__
             return f"{pair[0].name} is left out: it cannot be read ({with_suffix:.80})"

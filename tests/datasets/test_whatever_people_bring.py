@@ -370,6 +370,9 @@ def test_llff_poses_of_fewer_photographs_are_told_apart_by_the_model(tmp_path):
     (tmp_path / "sparse/0/images.txt").write_text("".join(lines))
     dataset = load_dataset(tmp_path, "val")
     assert names[0] in said(dataset, "1 images have no pose")
+    (tmp_path / "sparse/0/images.txt").rename(tmp_path / "sparse/0/Images.TXT")
+    (tmp_path / "sparse").rename(tmp_path / "Sparse")
+    assert names[0] in said(load_dataset(tmp_path, "val"), "1 images have no pose")
 
 
 def test_the_largest_colmap_model_is_read_whatever_its_number(tmp_path):

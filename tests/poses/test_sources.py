@@ -79,8 +79,11 @@ def test_photographs_reach_no_other_decoders(tmp_path, monkeypatch):
 
     monkeypatch.setattr(EpsImagePlugin, "EpsImageFile", lambda *a: pytest.fail("PostScript is decoded"))
     (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\n")
-    copies, bad = copy_photographs([tmp_path / "a.png"], tmp_path / "out", 100)
-    assert not copies and "cannot identify image file" in bad[0]
+    (tmp_path / "b.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(99))  # as programs rename what phones write
+    copies, bad = copy_photographs([tmp_path / "a.png", tmp_path / "b.jpg"], tmp_path / "out", 100)
+    assert not copies and len(bad) == 2
+    assert "a.png is left out" in bad[0] and "its content is PostScript" in bad[0]
+    assert "b.jpg is left out" in bad[1] and "its content is HEIC" in bad[1] and "convert it to JPEG" in bad[1]
 
 
 def test_groups_by_size_camera_and_focal_length(tmp_path):
