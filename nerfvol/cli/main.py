@@ -10,6 +10,7 @@ import argparse
 import importlib
 import pkgutil
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -38,6 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def guard(run: Callable[[], int]) -> int:
     """The exit code of ``run``; what the user has to put right is said in one sentence instead of a traceback."""
+    # Of damaged EXIF and the like, which decides nothing: with a line of Pillow's source they are no sentence.
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")
     with screens():
         return _guarded(run)
 

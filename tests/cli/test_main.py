@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,7 @@ def test_no_arguments_and_version(command):
         (["train", "--data", ".", "--out", "x", "--time-budget", "soon"], "time_budget: expected a duration"),
         (
             ["train", "--data", ".", "--out", "x", "--init", "nothing"],
-            "init: expected auto, direct, mlp, points, sweep, points+sweep, random or a file of splats or an octree",
+            "init: expected auto, direct, mlp, points, sweep, points+sweep, hull, random or a file of splats or an octree",
         ),
         (["train", "--data", ".", "--out", "x", "--config", "none.yaml"], "no such file: none.yaml"),
         (["train", "--data", ".", "--out", "x", "--seed", "one"], "seed: expected a whole number, got 'one'"),
@@ -140,6 +141,18 @@ def test_defects_keep_their_traceback():
 
     with pytest.raises(ZeroDivisionError):
         main.guard(fail)
+
+
+def test_what_pillow_thinks_of_damaged_exif_is_not_shown():
+    """A line of its source, once for each kind of damage, beside which the pictures are read all the same."""
+
+    def warn():
+        warnings.warn_explicit("Corrupt EXIF data.", UserWarning, "TiffImagePlugin.py", 1, module="PIL.TiffImagePlugin")
+        return 0
+
+    assert main.guard(warn) == 0
+    with pytest.raises(UserWarning, match="other"):
+        main.guard(lambda: warnings.warn_explicit("other", UserWarning, "x.py", 1, module="x") or 0)
 
 
 def test_the_packages_share_one_kind_of_sentence(command):
