@@ -19,6 +19,8 @@ Places = NDArray[np.float64]
 
 POINTS = 2_000
 """At most: the surface of a thing that fills its box has 10 cells for each of them, and steps cost by the splat."""
+FEWEST = 300
+"""Points where the surface has fewer cells, some in each: a small thing in a large box, for splats grow by being split."""
 CELLS = 40
 """Along each side of the box: 64 take six times as long and train no better."""
 VIEWS = 16
@@ -60,7 +62,8 @@ def hull_points(dataset: Dataset, n: int = POINTS, seed: int = 0) -> PointCloud:
     if not len(surface):
         return PointCloud.empty()
     random = np.random.default_rng(seed)
-    chosen = surface[np.sort(random.permutation(len(surface))[:n])]
+    cells = np.repeat(surface, -(-FEWEST // len(surface)), axis=0)
+    chosen = cells[np.sort(random.permutation(len(cells))[:n])]
     colours = _colours(low + (chosen + 0.5) * side, low + (surface + 0.5) * side, seen, BEHIND * float(side.max()))
     return PointCloud(low + (chosen + random.random(chosen.shape)) * side, colours)
 

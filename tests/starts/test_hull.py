@@ -69,6 +69,15 @@ def test_the_same_seed_gives_the_same_points_and_fewer_cells_all_of_them():
     assert len({tuple(c) for c in np.floor((every.positions + 1) / CELL).astype(int)}) == len(every) > 700
 
 
+def test_a_small_thing_in_a_large_box_has_several_points_in_each_cell(monkeypatch):
+    monkeypatch.setattr("tests.starts.test_hull.RADIUS", 0.06)
+    cloud = hull.hull_points(dataset())
+    cells = {tuple(c) for c in np.floor((cloud.positions + 1) / CELL).astype(int)}
+    assert 0 < len(cells) < 100 and hull.FEWEST <= len(cloud) < hull.FEWEST + len(cells)
+    assert len(np.unique(cloud.positions, axis=0)) == len(cloud)
+    assert np.linalg.norm(cloud.positions - MIDDLE, axis=1).max() < 0.06 + 3 / LENS.fx + 3 * CELL
+
+
 def test_one_empty_mask_does_not_carve_all_away_but_two_things_leave_nothing():
     images = [ball(c) for c in around()]
     images[0] = np.zeros_like(images[0])
@@ -120,6 +129,11 @@ def test_cut_out_objects_begin_with_it():
         choose_start(opaque, Photographs(opaque), "hull")
     alphas = dataset([np.dstack([i[..., :3], np.full(i.shape[:2], 255, np.uint8)]) for i in data.images])
     assert choose_start(alphas, Photographs(alphas)).name == "random"  # its hull would be the box
+    corner = np.zeros_like(data.images[0])
+    corner[:5, :5] = 255
+    apart = dataset([corner] * len(data))
+    start = choose_start(apart, Photographs(apart))  # which is how objects begin that are not cut out
+    assert start.name == "random" and start.sentence.endswith("box instead (an object whose pictures are cut out)")
     few = dataset([*data.images[:8], *alphas.images[8:]])
     most = dataset([*data.images[:12], *alphas.images[12:]])
     assert not hull.has_silhouettes(few) and hull.has_silhouettes(most)
