@@ -152,7 +152,7 @@ class DistillConfig(Checked):
     section: ClassVar[str] = "distill"
     former: ClassVar[Mapping[str, str]] = {
         "density_scale": "it is always 300, as in octrees that start from low density",
-        "samples_per_vertex": "it is always 4 a cell",
+        "samples_per_vertex": "it is always 4",
         "visibility_downscale": "images are made so small that about 200 pixels are left along them, at most by 4",
         "compare_downscale": "images are made so small that about 200 pixels are left along them, at most by 4",
         "compare_views": "it is always 2",

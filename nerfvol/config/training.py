@@ -142,15 +142,16 @@ class Config(Checked):
             return "splats" if scene.is_unbounded else "octree"
         return "octree" if self.init in OCTREE_STARTS else "splats"
 
-    def for_views(self, n: int, scene: SceneBounds) -> Config:
+    def for_views(self, n: int, scene: SceneBounds, as_field: bool | None = None) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
         few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
-        smoothness in any case."""
+        smoothness in any case. ``as_field``: whether a run that is resumed, perhaps with another budget, began as one."""
         few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
         if not few:
             return self
-        short = self.time_budget is not None and self.time_budget <= SHORT_RUN
-        init = "mlp" if self.init == "auto" and not short else self.init
+        if as_field is None:
+            as_field = self.time_budget is None or self.time_budget > SHORT_RUN
+        init = "mlp" if self.init == "auto" and as_field else self.init
         return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS))
 
     def for_pictures(self, side: int) -> Config:

@@ -53,7 +53,8 @@ def choose_start(dataset: Dataset, photographs: Photographs, name: str | None = 
         raise InputError(f"the start {name!r} cannot be used: {found}")
     if not len(cloud):
         cloud = random_points(dataset.scene, seed=seed)
-        chosen, found = "random", f"{found}; {len(cloud)} random points in the scene's box instead: expect little"
+        instead = f"{len(cloud)} random points in the scene's box instead"
+        chosen, found = "random", f"{found}; {instead}{': expect little' if dataset.scene.is_unbounded else ''}"
     return Start(cloud, subject, chosen, f"start: {found} ({why})")
 
 

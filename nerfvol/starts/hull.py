@@ -19,6 +19,8 @@ Places = NDArray[np.float64]
 
 POINTS = 2_000
 """At most: the surface of a thing that fills its box has 10 cells for each of them, and steps cost by the splat."""
+FEWEST = 300
+"""Points where the surface has fewer cells, some in each: a small thing in a large box, for splats grow by being split."""
 CELLS = 40
 """Along each side of the box: 64 take six times as long and train no better."""
 VIEWS = 16
@@ -31,29 +33,37 @@ AGREE = 0.9
 """Of the views that have a cell in their picture: as many must show something there. One bad mask must not carve all away."""
 SEEN = 0.5
 """Of all views: as many must have a cell in their picture, else it is left out."""
+CUT_OUT = 0.5
+"""Of the views: as many must have something transparent, else too few carve."""
 BEHIND = 1.5
 """Cells by which a point may lie behind the first on its ray and still have its colour."""
 
 
 def has_silhouettes(dataset: Dataset) -> bool:
-    """Whether it is an object whose pictures are cut out: what a hull is carved with."""
-    return not dataset.scene.is_unbounded and dataset.masks is None and all(i.shape[2] == 4 for i in dataset.images)
+    """Whether it is an object whose pictures are cut out: what a hull is carved with. An opaque alpha cuts nothing out, and
+    what it would leave is the box."""
+    if dataset.scene.is_unbounded or dataset.masks is not None or any(i.shape[2] != 4 for i in dataset.images):
+        return False
+    looked = dataset.evenly(VIEWS).images
+    return sum(bool((image[::4, ::4, 3] < OPAQUE).any()) for image in looked) >= CUT_OUT * len(looked)
 
 
 def hull_points(dataset: Dataset, n: int = POINTS, seed: int = 0) -> PointCloud:
     """At most n points on the surface of the visual hull of a dataset that :func:`has_silhouettes`, each somewhere in its
     cell; the same ones for the same seed. None where the silhouettes have nothing in common."""
     views = dataset.evenly(VIEWS)
-    k = max(1, min(views.images[0].shape[:2]) // PICTURE)
-    pictures = map_threads(lambda image: area_average(image, k), list(views.images), dataset.threads)
-    seen = list(zip([camera.scaled(k) for camera in views.cameras], pictures, strict=True))
+    factors = [max(1, min(image.shape[:2]) // PICTURE) for image in views.images]
+    pictures = map_threads(lambda pair: area_average(*pair), zip(views.images, factors, strict=True), dataset.threads)
+    cameras = [camera.scaled(k) for camera, k in zip(views.cameras, factors, strict=True)]
+    seen = list(zip(cameras, pictures, strict=True))
     low, high = dataset.scene.aabb
     side = (high - low) / CELLS
     surface = _surface(_carved(seen, low, side))
     if not len(surface):
         return PointCloud.empty()
     random = np.random.default_rng(seed)
-    chosen = surface[np.sort(random.permutation(len(surface))[:n])]
+    cells = np.repeat(surface, -(-FEWEST // len(surface)), axis=0)
+    chosen = cells[np.sort(random.permutation(len(cells))[:n])]
     colours = _colours(low + (chosen + 0.5) * side, low + (surface + 0.5) * side, seen, BEHIND * float(side.max()))
     return PointCloud(low + (chosen + random.random(chosen.shape)) * side, colours)
 
@@ -71,7 +81,7 @@ def _carved(seen: list[tuple[Camera, UInt8]], low: Places, side: Places) -> NDAr
         there[held] = picture[y[held], x[held], 3] >= OPAQUE
         shown[left] += there
         missed[left] += held & ~there
-        left = left[missed[left] <= (1 - AGREE) * len(seen)]  # what more views miss, the others cannot save
+        left = left[missed[left] <= len(seen) - AGREE * len(seen)]  # what more views miss, the others cannot save
     out = np.zeros(len(middles), bool)
     counted = shown[left] + missed[left]
     out[left] = (counted >= SEEN * len(seen)) & (shown[left] >= AGREE * counted)

@@ -48,8 +48,10 @@ OPAQUE = 0.999
 """Pixels with transparency whose colour is the thing's alone: these have a colour map fitted."""
 Mode = Literal["auto", "on", "off"]
 
-Seen = Callable[[int], tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]]
-"""Index of a view -> its photograph (h, w, 3), what the model shows there (h, w, 3), both in [0, 1], and weights (h, w)."""
+Look = tuple[NDArray[np.floating], NDArray[np.floating], NDArray[np.floating]]
+"""A view's photograph (h, w, 3), what the model shows there (h, w, 3), both in [0, 1], and weights (h, w)."""
+Seen = Callable[[int], Look]
+"""Index of a view -> its look."""
 
 
 class Appearance:
@@ -90,15 +92,13 @@ class Appearance:
         while self.rounds < len(MOMENTS) and progress >= MOMENTS[self.rounds]:
             self.rounds += 1  # a run on a clock may jump over moments
         needs_sight = self.active or self.mode == "auto"
-        if (
-            needs_sight
-            and len(self.maps) > FIRST_ASKED
-            and not _shows_enough(seen, evenly(len(self.maps), FIRST_ASKED))
-        ):
+        first = evenly(len(self.maps), FIRST_ASKED) if needs_sight and len(self.maps) > FIRST_ASKED else []
+        looked = {i: seen(i) for i in first}
+        if looked and not _shows_enough(list(looked.values())):
             return False
         fitted, halves, explained = [], [], []
         for i in range(len(self.maps)):
-            photograph, shown, weight = seen(i)
+            photograph, shown, weight = looked[i] if i in looked else seen(i)
             fitted.append(fit_colour_map(shown, photograph, weight))
             explained.append(share_explained(fitted[-1], shown, photograph, weight))
             if not self.active:
@@ -175,11 +175,9 @@ def centred(maps: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([compose(m, undo) for m in maps])
 
 
-def _shows_enough(seen: Seen, views: Sequence[int]) -> bool:
+def _shows_enough(looked: Sequence[Look]) -> bool:
     """Whether the model shows enough of these views for their exposures to be asked for."""
-    asked = [seen(i) for i in views]
-    explained = [share_explained(fit_colour_map(b, a, w), b, a, w) for a, b, w in asked]
-    return bool(np.median(explained) >= LEAST_SHOWN)
+    return bool(np.median([share_explained(fit_colour_map(b, a, w), b, a, w) for a, b, w in looked]) >= LEAST_SHOWN)
 
 
 def exposures_differ(halves: NDArray[np.float64]) -> bool:

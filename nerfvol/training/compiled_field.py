@@ -212,7 +212,7 @@ class CompiledFieldTrainer:
 
     def _follow_samples(self, per_ray: float) -> None:
         """Choose the next number of rays so that a step has about ``samples_per_step`` samples."""
-        wanted = field_schedule.samples_wanted(self.config, self.steps_done) / max(per_ray, 0.25)
+        wanted = self.config.samples_per_step / max(per_ray, 0.25)
         self.n_rays = max(1, min(MOST_RAYS, int(min(wanted, 1.25 * self.n_rays + 16))))
 
     def _bank(self, downscale: int) -> Pixels:
@@ -227,6 +227,7 @@ class CompiledFieldTrainer:
             "grid": self.occupancy.state_dict(),
             "steps_done": self.steps_done,
             "n_rays": self.n_rays,
+            "march_steps": self.march.n_steps,  # of photographs' fields these are drawn with
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -237,3 +238,7 @@ class CompiledFieldTrainer:
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(f"the checkpoint's field does not fit the configured network: {error}") from error
         self.steps_done, self.n_rays = int(state["steps_done"]), int(state["n_rays"])
+        steps, most = int(state.get("march_steps", self.march.n_steps)), max(self.config.march_steps)
+        if not 1 <= steps <= most:
+            raise InputError(f"the checkpoint's field has {steps} steps along a ray, expected 1 to {most}")
+        self.march = self.march.with_steps(steps)

@@ -12,8 +12,6 @@ is blurred more rays teach it more than finer steps."""
 COARSE_LEVELS = ((32, 4), (128, 6))
 """Until so many steps are done, only so many levels of the grid are in use: haze of all space would move all entries of finer
 ones, and nothing is known that fine."""
-SMALLER = ((128, 1),)
-"""Until so many steps are done, a step has so many times fewer samples: ..."""
 NEGLIGIBLE = 0.25
 """Samples whose gradient is below this share of the mean one play Russian roulette: half of the samples have a fiftieth of the
 gradient, and the backward pass is half of a step."""
@@ -35,11 +33,6 @@ def march_steps(config: FieldConfig, stage: int, step: int) -> int:
 def levels_in_use(n_levels: int, step: int) -> int:
     """Of the grid's ``n_levels``, the coarsest so many."""
     return min(n_levels, next((n for until, n in COARSE_LEVELS if step < until), n_levels))
-
-
-def samples_wanted(config: FieldConfig, step: int) -> float:
-    """Samples of a step."""
-    return config.samples_per_step / next((factor for until, factor in SMALLER if step < until), 1)
 
 
 def moves(n_levels: int, step: int) -> list[bool]:

@@ -155,7 +155,7 @@ class OctreeTrainer(GrowingOctree):
         return {
             **self.leaves_saved(),
             "stage": self.stage, "first_stage": self.first_stage, "steps_done": self.steps_done,
-            "stage_steps": self.stage_steps,
+            "progress": self._progress, "stage_steps": self.stage_steps,
             "keeps_solid": self.keeps_solid, "prunings": self.prunings,
             "cursors": dataclasses.asdict(self.cursors), "appearance": self.appearance.state_dict(),
         }  # fmt: skip
@@ -169,6 +169,9 @@ class OctreeTrainer(GrowingOctree):
         self.load_leaves(state)
         for name in ("stage", "first_stage", "steps_done", "prunings"):
             setattr(self, name, int(state[name]))
+        self._progress = float(state.get("progress", 0.0))  # the pace, by which a run without a step left is finished
+        if not 0 <= self._progress < math.inf:
+            raise ValueError(f"progress {self._progress}")
         self.keeps_solid = bool(state.get("keeps_solid", False))
         self.stage_steps = np.array(state.get("stage_steps", self.stage_steps), np.int64)
         if self.stage_steps.shape != (len(self.config.levels),):

@@ -39,7 +39,7 @@ def affordable_scores(run: Run, model: Model, held_out: Dataset) -> dict[str, An
         return max(FEWEST_SCORED, len(rows) + int(max(0.0, budget - run.clock.elapsed()) / seconds)), seconds
 
     n, each = affordable(0)
-    if FEWEST_SCORED <= total and n < total:
+    if n < total:
         n, each = affordable(total - 1)
     if n < total:
         run.say(f"a view takes {each:.1f} s to draw and score: {n} of the {total} held-out views are scored, evenly chosen, to "

@@ -60,7 +60,7 @@ class Run:
         sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in data.training.cameras)
         scene = data.training.scene
         if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
-            config = config.for_views(len(data.training), scene)
+            config = config.for_views(len(data.training), scene, "field" in saved["steps"] if saved else None)
         suited = config.for_scene(scene).for_pictures(sides[len(sides) // 2])
         self.config = suited.before(data.training.backdrop)
         self.background: tuple[float, float, float] = self.config.background or WHITE

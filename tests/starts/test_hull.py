@@ -69,6 +69,15 @@ def test_the_same_seed_gives_the_same_points_and_fewer_cells_all_of_them():
     assert len({tuple(c) for c in np.floor((every.positions + 1) / CELL).astype(int)}) == len(every) > 700
 
 
+def test_a_small_thing_in_a_large_box_has_several_points_in_each_cell(monkeypatch):
+    monkeypatch.setattr("tests.starts.test_hull.RADIUS", 0.06)
+    cloud = hull.hull_points(dataset())
+    cells = {tuple(c) for c in np.floor((cloud.positions + 1) / CELL).astype(int)}
+    assert 0 < len(cells) < 100 and hull.FEWEST <= len(cloud) < hull.FEWEST + len(cells)
+    assert len(np.unique(cloud.positions, axis=0)) == len(cloud)
+    assert np.linalg.norm(cloud.positions - MIDDLE, axis=1).max() < 0.06 + 3 / LENS.fx + 3 * CELL
+
+
 def test_one_empty_mask_does_not_carve_all_away_but_two_things_leave_nothing():
     images = [ball(c) for c in around()]
     images[0] = np.zeros_like(images[0])
@@ -76,6 +85,27 @@ def test_one_empty_mask_does_not_carve_all_away_but_two_things_leave_nothing():
     corner = np.zeros_like(images[0])
     corner[:5, :5] = 255
     assert len(hull.hull_points(dataset([corner] * len(images)))) == 0
+
+
+def test_one_bad_mask_of_ten_is_what_a_tenth_allows():
+    data = dataset()
+    ten = data.chosen(range(0, 20, 2))
+    images = [np.zeros_like(ten.images[0]), *ten.images[1:]]
+    assert len(hull.hull_points(dataclasses.replace(ten, images=images), 10**6)) > 700
+
+
+def test_pictures_of_several_sizes_carve_each_at_its_own():
+    """A first picture of 400 pixels and others of 50: the same ball, within a pixel of the small ones."""
+    data = dataset()
+    large = LENS.resized(480, 400)
+    images = [np.repeat(np.repeat(data.images[0], 8, axis=0), 8, axis=1), *data.images[1:]]
+    cameras = [data.cameras[0].through(large), *data.cameras[1:]]
+    cloud = hull.hull_points(dataclasses.replace(data, images=images, cameras=cameras), 10**6)
+    alike = hull.hull_points(data, 10**6)
+    assert abs(len(cloud) - len(alike)) < 0.05 * len(alike)
+    narrow = dataclasses.replace(LENS, width=3, cx=1.5)  # of which a factor for the first would leave nothing
+    images[1], cameras[1] = images[1][:, 29:32], cameras[1].through(narrow)
+    assert len(hull.hull_points(dataclasses.replace(data, images=images, cameras=cameras), 10**6))
 
 
 def test_what_few_pictures_hold_is_left_out():
@@ -97,5 +127,15 @@ def test_cut_out_objects_begin_with_it():
     assert choose_start(opaque, Photographs(opaque)).name == "random"
     with pytest.raises(InputError, match="'hull' cannot be used: its pictures have no silhouettes"):
         choose_start(opaque, Photographs(opaque), "hull")
+    alphas = dataset([np.dstack([i[..., :3], np.full(i.shape[:2], 255, np.uint8)]) for i in data.images])
+    assert choose_start(alphas, Photographs(alphas)).name == "random"  # its hull would be the box
+    corner = np.zeros_like(data.images[0])
+    corner[:5, :5] = 255
+    apart = dataset([corner] * len(data))
+    start = choose_start(apart, Photographs(apart))  # which is how objects begin that are not cut out
+    assert start.name == "random" and start.sentence.endswith("box instead (an object whose pictures are cut out)")
+    few = dataset([*data.images[:8], *alphas.images[8:]])
+    most = dataset([*data.images[:12], *alphas.images[12:]])
+    assert not hull.has_silhouettes(few) and hull.has_silhouettes(most)
     masked = dataclasses.replace(data, masks=[None] * len(data))
     assert not hull.has_silhouettes(masked)

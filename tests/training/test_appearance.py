@@ -105,7 +105,10 @@ def test_fog_takes_no_bright_side_for_an_exposure():
     appearance = Appearance(12)
     assert not appearance.fit(fog, MOMENTS[0]) and not appearance.decided and appearance.due(MOMENTS[1])
     assert len(asked) == FIRST_ASKED  # each is a picture of fog, which is slow to draw
-    assert appearance.fit(seen_with(GAINS, scene), MOMENTS[1])
+    clear = seen_with(GAINS, scene)
+    asked.clear()
+    assert appearance.fit(lambda i: asked.append(i) or clear(i), MOMENTS[1])
+    assert sorted(asked) == list(range(12))  # none is drawn twice
 
 
 def test_uneven_photographs_come_to_one_exposure():

@@ -20,6 +20,7 @@ from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory import OctreePlan, gib, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.scoring import affordable_scores
+from nerfvol.training.session import Run
 from tests.fixtures.runs import Pretended, log_of, run_of, settings, start
 
 
@@ -138,6 +139,19 @@ def test_a_budget_that_is_over_before_the_start(tmp_path, tiny_scene):
     start(settings(tiny_scene, tmp_path, time_budget=1.0), started=time.perf_counter() - 10)
     assert json.loads((tmp_path / run_folder.METRICS).read_text())["steps"] == {"octree": 0}
     assert load_octree(tmp_path / run_folder.OCTREE)[0].n_leaves > 0
+
+
+@pytest.mark.parametrize(
+    "steps, start", [({"field": 7}, "mlp"), ({"field": 9, "octree": 3}, "mlp"), ({"octree": 3}, "auto")]
+)
+def test_another_budget_changes_no_start_of_a_resumed_run(tmp_path, tiny_scene, compiled, steps, start):
+    """Of few views: at 8 seconds none begins as a field, at 100 each does; a field that was begun is not thrown away."""
+    saved = {"phase": list(steps)[-1], "log_bytes": 0, "results": {}, "steps": steps}
+    data = run_of(settings(tiny_scene, tmp_path)).data
+    for budget in (8.0, 100.0):
+        config = settings(tiny_scene, tmp_path, time_budget=budget, representation="octree", field={"few_views": 16})
+        assert Run(config, data, clock.Clock(None, 0.0), saved).config.init == start
+    assert Run(config, data, clock.Clock(None, 0.0), None).config.init == "mlp"
 
 
 def test_the_time_of_earlier_sessions_counts(monkeypatch):

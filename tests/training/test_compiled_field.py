@@ -12,6 +12,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.kernels.field_state import FieldState
+from nerfvol.region import SceneBounds
 from nerfvol.starts.field import distill
 from nerfvol.training import field_looks, field_schedule
 from nerfvol.training.compiled_field import CompiledFieldTrainer, Pixels
@@ -82,6 +83,25 @@ def test_the_same_bits_with_any_number_of_threads_and_resumed(threads, dataset: 
     for other in (*runs[1:], second):
         assert_same_bits(runs[0], other)
     assert trainer_of(dataset, seed=2).step().loss != reports[0]
+
+
+def test_photographs_are_drawn_alike_by_a_resumed_run_without_a_step(compiled, dataset: Dataset) -> None:
+    """Whose budget is over: with the steps along rays that the last step trained with, not the finest."""
+    box = dataset.scene.aabb
+    place = dataclasses.replace(dataset, scene=SceneBounds(box, 4 * box, False))
+    first, second = trainer_of(place), trainer_of(place)
+    for _ in range(3):
+        first.step()
+    state = first.state_dict()
+    second.load_state_dict(state)
+    assert second.trained_field().march.n_steps == first.trained_field().march.n_steps < SMALL.march_steps[0]
+    camera = place.cameras[0]
+    assert second.picture(camera).tobytes() == first.picture(camera).tobytes()
+    second.load_state_dict(
+        {name: value for name, value in state.items() if name != "march_steps"}
+    )  # as versions before
+    with pytest.raises(InputError, match="has 65 steps along a ray, expected 1 to 64"):
+        second.load_state_dict({**state, "march_steps": 65})
 
 
 def test_haze_that_is_gone_does_not_stay_occupied(compiled, dataset: Dataset) -> None:

@@ -116,6 +116,25 @@ def test_the_last_pruning_needs_to_have_seen_enough(tiny_scene):
     assert tuner.finish() is tuner.octree
 
 
+def test_the_last_pruning_of_a_resumed_run_without_a_step_is_the_same(tiny_scene):
+    """A short run's rays have seen enough sooner; how short it was is in its checkpoint."""
+    config = OctreeConfig(levels=[4], downscales=[2], stage_ends=[1.0], tiles=[16], prunes=[0], prune_steps=10**6)
+    first, again = (OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config, 0, None) for _ in range(2))
+    for step in range(30):
+        first.step((step + 1) / 30)
+    empty = first.octree.leaf_ijk[:, 0] >= 11
+    first.octree.density[first.octree.corners[empty]] = -60.0
+    first.state.max_weight[:] = np.where(empty, 0.0, 1.0)
+    first.state.footprint[:] = 1.0
+    again.load_state_dict(first.state_dict())
+    whole, resumed = first.finish(), again.finish()
+    assert whole.n_leaves < first.octree.n_leaves and resumed.n_leaves == whole.n_leaves
+    with pytest.raises(ValueError, match="progress nan"):
+        again.load_state_dict(
+            {**OctreeTrainer(first.dataset, (1, 1, 1), config).state_dict(), "progress": float("nan")}
+        )
+
+
 def test_the_last_stage_has_more_bands(tiny_scene):
     """They begin at zero, so the picture does not change; then they learn, and a resumed run has them too."""
     config = OctreeConfig(
