@@ -132,6 +132,10 @@ class OctreeConfig(Checked):
         """The same with a number for each None; photographs are scenes with background shells."""
         return filled(self, BOUNDED if not scene.is_unbounded else PHOTOGRAPHS)
 
+    def from_surfaces(self, scene: SceneBounds) -> OctreeConfig:
+        """The same for an octree that begins with the surfaces of splats, where nothing else is said."""
+        return filled(self, PHOTOGRAPHS_FROM_SURFACES if scene.is_unbounded else {})
+
     def for_pictures(self, side: int) -> OctreeConfig:
         """The same with stages that suit pictures of ``side`` pixels along their shorter side.
 
@@ -180,6 +184,9 @@ BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error"
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
                "sparsity": 1.2e-3, "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
 """Settings of an octree where nothing else is said."""
+PHOTOGRAPHS_FROM_SURFACES = {"sparsity": 3e-4, "decay_from": 0.6}
+"""... of photographs where it begins with surfaces, so that little haze is to be forbidden, and rates need not fall early
+(docs/experiments.md)."""
 FEW_VIEWS = {"tv_density": 3e-4, "tv_sh": 3e-4, "tv_from": 0}
 """... and of an object that few views show, which begins as a field (docs/experiments.md)."""
 

@@ -7,6 +7,7 @@ reads the settings, few use a field. u is the scene unit.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -28,7 +29,10 @@ MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
 SHORT_RUN = 10.0
 """Seconds of a time budget up to which an octree does not begin as a field: distilling it would take most of them."""
-OCTREE_STARTS = ("direct", "mlp")
+SPLATS_UNTIL = 45.0
+"""Seconds of a time budget up to which an octree of an object that many views show begins as splats: fog takes most of them to
+become surfaces. Later that costs nothing any more, and what splats left out would be missing (docs/performance.md)."""
+OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
 
@@ -49,7 +53,8 @@ class Config(Checked):
     """File of what is known of the light (medium.lighting): a medium is fitted that can be lit anew."""
     init: str = "auto"
     """Where it starts. An octree: "mlp", a small field that is trained and distilled (auto: of objects with few training
-    views), or "direct", low density everywhere (auto: of all else). A field: auto. Splats: "points" of a COLMAP model, "sweep"
+    views), "splats", which are trained first, too, and whose surfaces it begins with (auto: of other objects where time is
+    short), or "direct", low density everywhere (auto: of all else). A field: auto. Splats: "points" of a COLMAP model, "sweep"
     of planes through the photographs, "points+sweep", "random", or a file or run of splats or of an octree (auto: what there
     is)."""
     time_budget: Annotated[float | None, seconds] = None
@@ -121,7 +126,7 @@ class Config(Checked):
 
     def for_scene(self, scene: SceneBounds) -> Config:
         """The same with a number for each setting that the kind of scene decides."""
-        octree = self.octree.for_scene(scene)
+        octree = (self.octree.from_surfaces(scene) if self.init == "splats" else self.octree).for_scene(scene)
         distill = filled(self.distill, {"sh_degree": octree.sh_degree}).for_scene(scene)
         sections = {"octree": octree, "distill": distill, "splats": self.splats.for_scene(scene)}
         suited = self._suited(scene)
@@ -142,17 +147,25 @@ class Config(Checked):
             return "splats" if scene.is_unbounded else "octree"
         return "octree" if self.init in OCTREE_STARTS else "splats"
 
-    def for_views(self, n: int, scene: SceneBounds, as_field: bool | None = None) -> Config:
+    def for_views(self, n: int, scene: SceneBounds, is_simulated: bool = False, begun: Collection[str] = ()) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
         few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
-        smoothness in any case. ``as_field``: whether a run that is resumed, perhaps with another budget, began as one."""
-        few = self._suited(scene) == "octree" and n <= self.field.few_views and not scene.is_unbounded
-        if not few:
+        smoothness in any case. Of one that many views show splats are there sooner than fog has become surfaces.
+
+        is_simulated: the data may show a medium, whose density counts: no splats, which are surfaces. begun: the phases that a
+        resumed run has begun: another time budget, which it may have, must not choose another start.
+        """
+        if self._suited(scene) != "octree" or scene.is_unbounded:
             return self
-        if as_field is None:
-            as_field = self.time_budget is None or self.time_budget > SHORT_RUN
-        init = "mlp" if self.init == "auto" and as_field else self.init
-        return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS))
+        few, budget = n <= self.field.few_views, self.time_budget
+        if begun:
+            start = "mlp" if "field" in begun else "splats" if "splats" in begun else "auto"
+        elif few:
+            start = "auto" if budget is not None and budget <= SHORT_RUN else "mlp"
+        else:
+            start = "splats" if budget is not None and budget <= SPLATS_UNTIL and not is_simulated else "auto"
+        init = start if self.init == "auto" else self.init
+        return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS if few else {}))
 
     def for_pictures(self, side: int) -> Config:
         """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""

@@ -71,10 +71,6 @@ FIT = {
 }  # fmt: skip
 """Settings of the fit: one stage, and rates that fall from a fifth of it on."""
 
-TUNED_PHOTOGRAPHS = {"sparsity": 3e-4, "decay_from": 0.6}
-"""Settings of the training on photographs where nothing else is said: the octree begins with surfaces, so that little haze is
-to be forbidden, and rates need not fall early (docs/experiments.md)."""
-
 Say = Callable[[str], object]
 T = TypeVar("T")
 
@@ -152,15 +148,16 @@ def octree_of(
 
 
 def surfaces_of(
-    splats: Splats, scene: SceneBounds, cameras: Sequence[Camera], background: Sequence[float], level: int | None = None
-) -> Octree:
+    splats: Splats, scene: SceneBounds, cameras: Sequence[Camera], background: Sequence[float], level: int | None = None,
+    most_level: int = MOST_LEVEL,
+) -> Octree:  # fmt: skip
     """The octree of splats before any fit: leaves around them, dense where the cameras see surfaces and nowhere else.
 
     level: as in :func:`octree_of`, which raises the same; None: around photographs one finer, for what is nearer than the
-    scene's middle has smaller pixels, and no leaf is finer than those that see it ask for.
+    scene's middle has smaller pixels, and no leaf is finer than those that see it ask for, nor than ``most_level``.
     """
     if level is None:
-        level = min(finest_level(scene, cameras) + scene.is_unbounded, MOST_LEVEL)
+        level = min(finest_level(scene, cameras) + scene.is_unbounded, most_level)
     octree = octree_around(splats, scene, cameras, level)
     return _with_surfaces(
         octree, looked_at(SplatModel(splats), evenly(small_cameras(cameras, scene), LOOKS), background)[0]
@@ -225,9 +222,7 @@ def tuned_octree(
 
     The budget counts from the start of the process; writing, and scoring ``scored`` views with both models, lie within it.
     """
-    known = TUNED_PHOTOGRAPHS if dataset.scene.is_unbounded else {}
-    unsaid = {name: value for name, value in known.items() if getattr(config.octree, name) is None}
-    settings = dataclasses.replace(config.octree, steps=FINE_STEPS, **unsaid)
+    settings = dataclasses.replace(config.octree.from_surfaces(dataset.scene), steps=FINE_STEPS)
     trainer = OctreeTrainer(dataset, background, settings, config.seed, octree)
     _run(trainer, dataset.cameras[0], config.time_budget, scored, say)
     return trainer.finish()

@@ -58,6 +58,9 @@ BYTES_PER_LIT_PIXEL = 28
 """Per training pixel of a medium: a ray (six float32) and four bytes."""
 BYTES_PER_LIT_SAMPLE = 80
 """Per step along a ray of a medium, looked up or not: position, thickness, transmittance, and what torch keeps of them."""
+LOOK_BYTES = 40
+"""Per pixel of the pictures of splats that an octree of their surfaces is made by: colours, opacity and distance, float32, and
+what drawing them takes besides."""
 SHARE = 0.9
 """Of the memory at hand that a run may plan for."""
 
@@ -67,19 +70,20 @@ class OtherMemory:
     """What a run holds besides the octree and its training images.
 
     foreground_share: of the training tiles, those of the foreground. held_out_bytes: of images. field: whether the
-    octree comes from a field.
+    octree comes from a field. splats: bytes of all that is there while splats are trained that it comes from; 0: it does not.
     """
 
     foreground_share: float = 1.0
     held_out_bytes: int = 0
     field: bool = False
+    splats: int = 0
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
     """Bytes by use; ``leaves`` is the largest number of leaves that was planned for.
 
-    Images, octree and change are there at one time, the distillation of a field (0: there is none) at another.
+    Images, octree and change are there at one time, the distillation of a field or splats (0: there are none) at another.
     """
 
     base: int
@@ -88,15 +92,17 @@ class MemoryEstimate:
     change: int
     leaves: int
     distillation: int = 0
+    splats: int = 0
 
     @property
     def peak(self) -> int:
         """Everything at its largest."""
-        return self.base + max(self.images + self.octree + self.change, self.distillation)
+        return self.base + max(self.images + self.octree + self.change, self.distillation, self.splats)
 
     def sentence(self) -> str:
         """The parts in words."""
         before = f", before that {gib(self.distillation)} to distil the field" if self.distillation else ""
+        before = f", before that {gib(self.splats)} for splats" if self.splats else before
         return (
             f"{gib(self.peak)} at its peak: images {gib(self.images)}, an octree of up to {self.leaves:,} leaves "
             f"{gib(self.octree)}, changing it {gib(self.change)}, the program {gib(self.base)}{before}"
@@ -146,6 +152,7 @@ def estimate_training(
         change=change,
         leaves=leaves,
         distillation=dataset.nbytes + 3 * pixels + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
+        splats=other.splats,
     )
 
 
@@ -237,6 +244,26 @@ def photographs_held(dataset: Dataset, photographs: Photographs, factors: Sequen
     return dataset.nbytes + kept, kept / wanted
 
 
+def splat_bytes(schedule: Schedule, config: SplatConfig) -> int:
+    """Bytes of the most splats of ``schedule`` under training: parameters, moments, gradients and statistics."""
+    row = 4 * (11 + 3 * ((config.sh_degree or 0) + 1) ** 2)
+    return schedule.most * (4 * row + SPLAT_BYTES)
+
+
+def starting_splats_bytes(
+    dataset: Dataset,
+    photographs: Photographs,
+    schedule: Schedule,
+    config: SplatConfig,
+    held_out_bytes: int,
+    looked_at: int,
+) -> int:
+    """Bytes, next to the program, of splats that an octree is made of: while they are trained, and while pictures of
+    ``looked_at`` pixels in all tell their surfaces; the photographs are there meanwhile."""
+    held, _ = photographs_held(dataset, photographs, schedule.factors)
+    return held + held_out_bytes + max(splat_bytes(schedule, config), LOOK_BYTES * looked_at)
+
+
 def splat_memory(
     dataset: Dataset, photographs: Photographs, schedule: Schedule, config: SplatConfig, held_out_bytes: int
 ) -> str:
@@ -245,9 +272,7 @@ def splat_memory(
     The images of ``dataset`` and what ``photographs`` hold are there already.
     """
     held, kept = photographs_held(dataset, photographs, schedule.factors)
-    images = held + held_out_bytes
-    row = 4 * (11 + 3 * ((config.sh_degree or 0) + 1) ** 2)
-    splats = schedule.most * (4 * row + SPLAT_BYTES)
+    images, splats = held + held_out_bytes, splat_bytes(schedule, config)
     peak = BASE_BYTES + images + splats
     part = "" if kept == 1 else f" ({kept:.0%} of the sizes; the others are made again for each step)"
     sentence = (
@@ -294,13 +319,17 @@ class OctreePlan:
     Attributes: max_leaves, a bound on splitting; foreground_tiles, about so many training tiles show more than the background.
     """
 
-    def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int) -> None:
-        """Raises InputError where not even a coarse octree fits in the memory at hand."""
+    def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int, splats: int = 0) -> None:
+        """``splats``: bytes next to the program while splats are trained that it comes from; 0: there are none.
+
+        Raises:
+            InputError: not even a coarse octree fits in the memory at hand.
+        """
         self._dataset, lens = dataset, dataset.cameras[0].intrinsics
         share = foreground_share(dataset, config.background or WHITE)
         pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
         self.foreground_tiles = max(share, 0.01) * pixels / TILE_RAYS
-        self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp")
+        self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp", splats=splats)
         self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)
         self.max_leaves = affordable_leaves(dataset, self._degree, least=min(wanted, 1 << 18), other=self._other)

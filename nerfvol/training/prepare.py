@@ -36,10 +36,13 @@ from nerfvol.files.run_folder import (
     UNFINISHED,
 )
 from nerfvol.measure.metrics import WINDOW
+from nerfvol.measure.truth import TRUTH
 from nerfvol.starts.region import region_of_sweep
 
 Colour = tuple[float, float, float]
 
+PROVENANCE = "provenance.json"
+"""What simulated data have beside them, with or without TRUTH."""
 HELD_OUT_KEPT = 32 << 20
 """Bytes of held-out images that a run keeps; more are read once again to be scored."""
 COMPARED_SIZE = 200
@@ -187,6 +190,12 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
     moved = [frame.dataset_into(d) for d in (training, held_out, compared, first)]
     lights = None if config.light is None else zlib.crc32(read_bytes(config.light))
     return Data(moved[0], moved[1], moved[2], moved[3], reading, frame, fingerprint(training, lights))
+
+
+def is_simulated(data: str) -> bool:
+    """Whether what the images show was simulated, and may be a medium: the truth or the provenance lies beside them."""
+    folder = Path(data) if Path(data).is_dir() else Path(data).parent
+    return any((folder / name).is_file() for name in (TRUTH, PROVENANCE))
 
 
 def require_same(saved: Mapping[str, Any] | None, data: Data, checkpoint: Path) -> None:

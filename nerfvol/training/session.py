@@ -32,7 +32,7 @@ from nerfvol.training.clock import Clock, first_signal_noted
 from nerfvol.training.compiled_field import compiled_refusal
 from nerfvol.training.finishing import seconds_of_picture, seconds_to_finish, seconds_to_score
 from nerfvol.training.phase import Phase
-from nerfvol.training.prepare import Data, claim_folder
+from nerfvol.training.prepare import Data, claim_folder, is_simulated
 from nerfvol.views import OctreeModel, SplatModel
 
 PREVIEW_SHARE, PREVIEW_SECONDS = 0.01, 0.08
@@ -60,7 +60,8 @@ class Run:
         sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in data.training.cameras)
         scene = data.training.scene
         if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
-            config = config.for_views(len(data.training), scene, "field" in saved["steps"] if saved else None)
+            begun = (saved or {}).get("steps", ())
+            config = config.for_views(len(data.training), scene, is_simulated(config.data), begun)
         suited = config.for_scene(scene).for_pictures(sides[len(sides) // 2])
         self.config = suited.before(data.training.backdrop)
         self.background: tuple[float, float, float] = self.config.background or WHITE

@@ -1,13 +1,16 @@
-"""What the splats of a run begin with, and the schedule that its seconds allow."""
+"""What the splats of a run begin with, and the schedule that its seconds allow; and splats that are an octree's start."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from nerfvol.config.splats import SplatConfig
+from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels.splat_state import SplatState
@@ -19,19 +22,48 @@ from nerfvol.starts.surfels import surfels
 from nerfvol.starts.visible import JUDGING_VIEWS, judged_downscale, largest_weights
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule, saved_schedule
+from nerfvol.training.splat_trainer import SplatTrainer
 
 OPACITIES = {"random": 0.3, "hull": 0.8}
 """Random points are mostly nowhere: they begin fainter than points that were found (0.5); what silhouettes leave is opaque."""
 
 
+START_SHARE = 0.35
+"""Of the time left in a run, what splats take that an octree is made of, ..."""
+START_STEPS = 700
+"""... and their steps, at most, where there is no time budget."""
+SECONDS_TO_CONVERT = 3.0
+"""Kept for the end of a run while such splats are trained: the octree of their surfaces, and what that takes to be written."""
+
+
+class StartingSplats(SplatTrainer):
+    """Splats that an octree is made of: they leave most of the time to it."""
+
+    def share_of(self, seconds: float) -> float:
+        """START_SHARE of the time left."""
+        return START_SHARE * seconds
+
+    def seconds_to_write(self) -> float:
+        """Their octree comes first."""
+        return SECONDS_TO_CONVERT
+
+
+def settings_of(config: Config) -> SplatConfig:
+    """Those of the run's splats: where they are a start, START_STEPS at most."""
+    if config.representation != "octree":
+        return config.splats
+    return dataclasses.replace(config.splats, steps=min(config.splats.steps, START_STEPS))
+
+
 def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
-    """The schedule of the seconds that the run has left, or of its steps; a resumed run's is the checkpoint's."""
+    """The schedule of the seconds that the run has left for splats, or of their steps; a resumed run's is the checkpoint's."""
     config = run.config
     if run.phase == "splats":
         with _saved_of(run) as saved:
             return saved_schedule(saved)
     left = run.seconds_left()
-    seconds = config.splats.steps * SECONDS_PER_STEP if left is None else left
+    share = START_SHARE if config.representation == "octree" else 1.0
+    seconds = settings_of(config).steps * SECONDS_PER_STEP if left is None else share * left
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
     return make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
 
@@ -56,9 +88,10 @@ def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats,
     if run.phase == "splats":  # the checkpoint has them
         with _saved_of(run) as saved:
             return SplatState.from_arrays(saved).splats(), float(saved["subject_distance"])
-    if config.init not in ("auto", *STARTS):
-        return _from_file(run, config.init, degree, most), subject_of(dataset).distance
-    start = choose_start(dataset, photographs, None if config.init == "auto" else config.init, config.seed)
+    init = "auto" if config.representation == "octree" else config.init
+    if init not in ("auto", *STARTS):
+        return _from_file(run, init, degree, most), subject_of(dataset).distance
+    start = choose_start(dataset, photographs, None if init == "auto" else init, config.seed)
     run.say(start.sentence)
     opacity = OPACITIES.get(start.name, 0.5)
     distance, cloud = start.subject.distance, start.cloud

@@ -1,4 +1,4 @@
-"""The training run, from top to bottom: data, (field, distillation,) octree, or splats, or a field or a medium alone,
+"""The training run, from top to bottom: data, (field or splats first,) octree, or splats, or a field or a medium alone,
 scores.
 
 Without a time budget a run is a fixed number of steps and no clock is read for anything but the log and the moments of
@@ -12,18 +12,14 @@ A checkpoint holds all that lives between two steps. It is written after the fir
 from __future__ import annotations
 
 import contextlib
-import copy
-import dataclasses
 import functools
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfvol import __version__
-from nerfvol.config.octree import FINEST_LEVEL
 from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
@@ -33,18 +29,18 @@ from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.files.lock import only_writer
 from nerfvol.kernels import ops
 from nerfvol.machine import describe_hardware, keep_large_arrays_apart, peak_memory, return_free_memory
-from nerfvol.measure.scores import COLOUR_MAPS, MEANS, evaluate, score_views
+from nerfvol.measure.scores import COLOUR_MAPS, evaluate
 from nerfvol.medium.lighting import load_lighting
 from nerfvol.models import Model, load_model
 from nerfvol.native import need_torch
-from nerfvol.octree.tree import Octree
 from nerfvol.starts.exposures import measure_exposures
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.clock import Clock
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.few_views import few_views
-from nerfvol.training.field_start import make_field_trainer, make_final_trainer
+from nerfvol.training.field_start import make_final_trainer
 from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, photographs_bytes, splat_memory
+from nerfvol.training.octree_start import prepare_splats, start_from_field, start_from_splats, summary, why_start
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
@@ -54,7 +50,6 @@ from nerfvol.training.saved import read_saved
 from nerfvol.training.scoring import affordable_scores
 from nerfvol.training.session import Run, Say, Watch
 from nerfvol.training.splat_trainer import SplatTrainer
-from nerfvol.views import OctreeModel
 
 if TYPE_CHECKING:
     from nerfvol.training.medium_trainer import MediumTrainer
@@ -160,15 +155,20 @@ def _train(
 
 # ------------------------------------------------------------------ what is trained
 def begin_octree(run: Run) -> OctreeTrainer:
-    """The trainer of an octree: from low density, or from a field that is trained first and distilled."""
+    """The trainer of an octree: from low density, or from a field or splats that are trained first."""
     config, data = run.config, run.data
-    plan = OctreePlan(config, data.training, data.held_out_bytes)
+    splats = prepare_splats(run) if config.init == "splats" and run.phase in ("start", "splats") else None
+    plan = OctreePlan(config, data.training, data.held_out_bytes, splats.bytes if splats else 0)
     announce(run, plan.sentence())
-    if config.init != run.given.init:
-        run.say(f"start: a field, then the octree that it is distilled to, for there are only {len(data.training)} training "
-                "views; --init direct overrules")  # fmt: skip
-    octree = start_from_field(run) if config.init == "mlp" and run.phase in ("start", "field") else None
-    return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan, appearance_of(run))
+    if config.init != run.given.init and (chosen := why_start(config, len(data.training))) is not None:
+        run.say(chosen)
+    octree, appearance = None, appearance_of(run)
+    if splats is not None:
+        octree = start_from_splats(run, splats, appearance_of(run, splats.photographs), appearance, optimise)
+        splats = None  # its photographs' memory is the octree's now
+    elif config.init == "mlp" and run.phase in ("start", "field"):
+        octree = start_from_field(run, optimise)
+    return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan, appearance)
 
 
 def begin_field(run: Run) -> CompiledFieldTrainer:
@@ -215,7 +215,7 @@ def appearance_of(run: Run, photographs: Photographs | None = None) -> Appearanc
     """The colour maps of the run's photographs, which say themselves whether they need any. Objects whose pictures have the
     background painted in, as splats see all of them, have none: a map would change the background too."""
     dataset, config = run.data.training, run.config
-    keeps_alpha = config.representation == "octree" and dataset.images[0].shape[2] == 4
+    keeps_alpha = config.representation == "octree" and photographs is None and dataset.images[0].shape[2] == 4
     mapped = dataset.scene.is_unbounded or keeps_alpha
     appearance = Appearance(len(dataset), config.appearance if mapped else "off")
     if appearance.mode != "off" and run.phase != config.representation:  # else the checkpoint knows
@@ -272,34 +272,6 @@ def optimise(run: Run, phase: Phase, make_bar: MakeBar | None = None) -> None:
         run.say(sentence)
     if phase.stages_left:
         run.say(f"the {phase.name} ended {phase.stages_left} stage(s) before the finest; a longer run would sharpen it")
-
-
-def start_from_field(run: Run) -> Octree:
-    """Trains the field and distils it; the octree, and the scores of both among the run's results."""
-    from nerfvol.starts.field import distill
-
-    config, background, data = run.config, run.background, run.data
-    field = make_field_trainer(data.training, config.field, config.seed, background)
-    ops.set_threads(ops.get_threads())  # torch may have been loaded only now
-    optimise(run, field)
-    run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
-                            "MB": field.parameter_bytes / 1e6}  # fmt: skip
-    settings = dataclasses.replace(
-        config.distill, level=min(config.distill.level or FINEST_LEVEL, max(config.octree.levels))
-    )
-    started = time.perf_counter()
-    octree, report = distill(field.trained_field(), field.domain, data.training, background, settings, field.picture)
-    for message in report.messages:
-        run.say(message)
-    run.say(str(report))
-    distilled = OctreeModel(octree, run.metadata())
-    in_units = OctreeModel(run.data.frame.octree_back(copy.copy(octree)), run.metadata())
-    written = in_units.save(run.folder / run_folder.DISTILLED, config.storage)
-    run.results["distilled"] = {"seconds": time.perf_counter() - started, "leaves": octree.n_leaves,
-                                "MB": written / 1e6, "lost_on_training_views_db": report.lost_db}  # fmt: skip
-    run.results["field"] |= summary(score_views(field.picture, data.compared, background))
-    run.results["distilled"] |= summary(evaluate(distilled, data.compared, background))
-    return octree
 
 
 def finish(run: Run, trained: list[Model]) -> Results:
@@ -363,8 +335,3 @@ class _NoBar(contextlib.AbstractContextManager["_NoBar"]):
 
     def update(self, more: float) -> None:
         """Nothing."""
-
-
-def summary(scores: dict[str, Any]) -> dict[str, Any]:
-    """Means of the scores, without the rows."""
-    return {key: scores[key] for key in (*MEANS, "seconds_per_frame") if key in scores}

@@ -15,7 +15,7 @@ from nerfvol.datasets.dataset import evenly
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
-from nerfvol.training import clock, field_trainer, finishing, octree_end, prepare, session
+from nerfvol.training import clock, field_trainer, finishing, octree_end, prepare, session, splat_start
 from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory import OctreePlan, gib, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
@@ -24,7 +24,7 @@ from nerfvol.training.session import Run
 from tests.fixtures.runs import Pretended, log_of, run_of, settings, start
 
 
-@pytest.mark.parametrize("init", ["direct", "mlp"])
+@pytest.mark.parametrize("init", ["direct", "mlp", "splats"])
 def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     """More steps than fit: by a clock that goes on 20 ms at every look, each phase gets its share and is finished."""
     looks = iter(range(10**9))
@@ -32,7 +32,7 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     monkeypatch.setattr(finishing, "EXPECTED_SECONDS_TO_WRITE", 100.0)
     monkeypatch.setattr(octree_end, "SECONDS_TO_WRITE", 100.0)
     config = settings(tiny_scene, tmp_path, init=init, time_budget=10.0, checkpoint_every=1000)
-    config.octree.steps = config.field.steps = 10**9
+    config.octree.steps = config.field.steps = config.splats.steps = 10**9
     start(config)
     metrics = json.loads((tmp_path / run_folder.METRICS).read_text())
     log = log_of(tmp_path)
@@ -42,6 +42,8 @@ def test_a_budget_ends_every_stage(tmp_path, tiny_scene, init, monkeypatch):
     assert log[-1]["seconds"] == pytest.approx(8, abs=0.1)
     if init == "mlp":
         assert metrics["results"]["field"]["seconds"] == pytest.approx(field_trainer.FIELD_SHARE * 8, abs=0.1)
+    if init == "splats":
+        assert metrics["results"]["splats"]["seconds"] == pytest.approx(splat_start.START_SHARE * 8, abs=0.1)
 
 
 def test_shares_of_a_budget(tmp_path, tiny_scene, monkeypatch):
@@ -137,7 +139,7 @@ def test_a_budget_is_kept(tmp_path, tiny_scene):
 
 def test_a_budget_that_is_over_before_the_start(tmp_path, tiny_scene):
     start(settings(tiny_scene, tmp_path, time_budget=1.0), started=time.perf_counter() - 10)
-    assert json.loads((tmp_path / run_folder.METRICS).read_text())["steps"] == {"octree": 0}
+    assert json.loads((tmp_path / run_folder.METRICS).read_text())["steps"] == {"splats": 0, "octree": 0}
     assert load_octree(tmp_path / run_folder.OCTREE)[0].n_leaves > 0
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.config.octree import OctreeConfig
+from nerfvol.config.octree import PHOTOGRAPHS_FROM_SURFACES, OctreeConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.kernels import ops
@@ -182,7 +182,7 @@ def test_photographs_are_tuned_with_settings_of_their_own(monkeypatch, is_unboun
     for config in (Config(), Config(octree=OctreeConfig(sparsity=0.5))):
         with pytest.raises(StopIteration):
             convert.tuned_octree(None, dataset, WHITE, config)
-    own = convert.TUNED_PHOTOGRAPHS if is_unbounded else {"sparsity": None, "decay_from": None}
+    own = PHOTOGRAPHS_FROM_SURFACES if is_unbounded else {"sparsity": None, "decay_from": None}
     assert [(s.sparsity, s.decay_from) for s in seen] == [
         (own["sparsity"], own["decay_from"]),
         (0.5, own["decay_from"]),

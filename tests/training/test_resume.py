@@ -37,7 +37,7 @@ class Whole:
     checkpoints: dict[tuple[str, int], Path]
 
 
-@pytest.fixture(scope="module", params=["direct", "mlp"])
+@pytest.fixture(scope="module", params=["direct", "mlp", "splats"])
 def whole(request, tmp_path_factory, tiny_scene) -> Whole:
     folder = tmp_path_factory.mktemp("whole")
     checkpoints = {}
@@ -120,25 +120,31 @@ def test_records(whole, command):
         assert metrics[key] == record[key], key
     assert metrics["leaves"] == load_octree(whole.run / run_folder.OCTREE)[0].n_leaves
     assert metrics["steps"]["octree"] == 60 and metrics["MB"] > 0 and metrics["vertices"] > metrics["leaves"]
-    mlp = metrics["init"] == "mlp"
-    assert list(metrics["results"]) == (["field", "distilled", "fine_tuned"] if mlp else [])
+    rows = {"direct": [], "mlp": ["field", "distilled", "fine_tuned"], "splats": ["splats", "converted", "fine_tuned"]}
+    assert list(metrics["results"]) == rows[metrics["init"]]
+    first = {"direct": {}, "mlp": {"field": 20}, "splats": {"splats": 25}}
+    assert metrics["steps"] == {**first[metrics["init"]], "octree": 60}
     for row in metrics["results"].values():
         assert {"psnr", "ssim", "seconds", "leaves", "MB", "seconds_per_frame"} <= row.keys()
-    assert (whole.run / run_folder.DISTILLED).exists() == mlp
+    assert (whole.run / run_folder.DISTILLED).exists() == (metrics["init"] == "mlp")
     names = {path.name for path in (whole.run / run_folder.PREVIEWS).iterdir()}
-    assert {"octree_010.png", "octree_100.png"} <= names and ("field_100.png" in names) == mlp
+    assert {"octree_010.png", "octree_100.png"} <= names and all(
+        f"{phase}_100.png" in names for phase in metrics["steps"]
+    )
     assert not [path.name for path in whole.run.iterdir() if ".tmp" in path.name]
     orbit = open_target(str(whole.run / run_folder.OCTREE)).orbit()
     assert orbit["radius"] == pytest.approx(3.2, rel=0.05) and orbit["center"] == pytest.approx([0, 0, 0], abs=0.05)
 
 
 def test_training_gains(whole):
-    """The picture is far better than the plain background's; fine-tuning gains on a distilled poor field."""
+    """The picture is far better than the plain background's; fine-tuning gains on a distilled poor field, and on the surfaces
+    of poor splats."""
     metrics = json.loads((whole.run / run_folder.METRICS).read_text())
     if metrics["init"] == "direct":
         assert metrics["psnr"] > 18  # a white picture scores 12
     else:
-        assert metrics["results"]["fine_tuned"]["psnr"] > metrics["results"]["distilled"]["psnr"] + 1
+        _, start, tuned = metrics["results"].values()
+        assert tuned["psnr"] > start["psnr"] + 1
 
 
 def test_a_finished_run_says_so(whole, command):

@@ -268,6 +268,7 @@ def test_photographs_of_two_sizes_and_lenses(tmp_path):
 @pytest.mark.parametrize("alpha, init, expected", [
     (True, "auto", "octree"), (True, "direct", "octree"), (True, "sweep", "splats"), (True, "random", "splats"),
     (False, "auto", "splats"), (False, "points", "splats"), (False, "direct", "octree"), (False, "mlp", "octree"),
+    (True, "splats", "octree"), (False, "splats", "octree"),
     (True, __file__, "splats"),
 ])  # fmt: skip
 def test_which_representation_suits(alpha, init, expected):
@@ -377,9 +378,9 @@ def test_a_run_goes_on_without_the_file_it_began_with(tmp_path, whole):
 @pytest.mark.parametrize("representation, init, reason", [
     ("splats", "fog", "expected auto, points, .*random or a file of splats or an octree for splats, got 'fog'"),
     ("splats", "mlp", "expected auto, points.* or a file of splats or an octree for splats, got 'mlp'"),
-    ("octree", "sweep", "expected auto, direct, mlp for octree, got 'sweep'"),
-    ("octree", "FILE", "expected auto, direct, mlp for octree, got '.*octree.safetensors'"),
-    ("auto", "fog", "expected auto, direct, mlp, points.* or a file of splats or an octree, got 'fog'"),
+    ("octree", "sweep", "expected auto, direct, mlp, splats for octree, got 'sweep'"),
+    ("octree", "FILE", "expected auto, direct, mlp, splats for octree, got '.*octree.safetensors'"),
+    ("auto", "fog", "expected auto, direct, mlp, splats, points.* or a file of splats or an octree, got 'fog'"),
     ("splats", "points", "the start 'points' cannot be used: .* without the points of a model"),
     ("mesh", "auto", "representation.*octree.*splats"),
 ])  # fmt: skip

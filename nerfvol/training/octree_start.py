@@ -1,0 +1,147 @@
+"""What an octree begins with besides low density: a field or splats, which are trained first as a phase of the run.
+
+Both end as an octree and as rows among the run's results; a run that is resumed inside of either goes on there.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from nerfvol.config.octree import FINEST_LEVEL
+from nerfvol.config.training import Config
+from nerfvol.datasets.photographs import Photographs
+from nerfvol.files import run_folder
+from nerfvol.kernels import ops
+from nerfvol.machine import return_free_memory
+from nerfvol.measure.scores import MEANS, evaluate, score_views
+from nerfvol.octree.tree import Octree
+from nerfvol.training.appearance import MOMENTS, Appearance, small_picture
+from nerfvol.training.field_start import make_field_trainer
+from nerfvol.training.memory import photographs_bytes, splat_memory, starting_splats_bytes
+from nerfvol.training.phase import Phase
+from nerfvol.training.session import Run
+from nerfvol.training.splat_schedule import Schedule
+from nerfvol.views import OctreeModel
+
+Optimise = Callable[[Run, Phase], None]
+"""Makes the steps of a phase (training.train.optimise)."""
+
+
+def why_start(config: Config, n_views: int) -> str | None:
+    """A sentence on the start that was chosen for ``n_views`` training views; None: low density, which needs none."""
+    if config.init == "mlp":
+        return (f"start: a field, then the octree that it is distilled to, for there are only {n_views} training "
+                "views; --init direct overrules")  # fmt: skip
+    if config.init == "splats":
+        return (f"start: splats, then the octree of the surfaces that they show, for {config.time_budget or 0:g} s are short; "
+                "--init direct overrules")  # fmt: skip
+    return None
+
+
+def start_from_field(run: Run, optimise: Optimise) -> Octree:
+    """Trains the field and distils it; the octree, and the scores of both among the run's results."""
+    from nerfvol.starts.field import distill
+
+    config, background, data = run.config, run.background, run.data
+    field = make_field_trainer(data.training, config.field, config.seed, background)
+    ops.set_threads(ops.get_threads())  # torch may have been loaded only now
+    optimise(run, field)
+    run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
+                            "MB": field.parameter_bytes / 1e6}  # fmt: skip
+    settings = dataclasses.replace(
+        config.distill, level=min(config.distill.level or FINEST_LEVEL, max(config.octree.levels))
+    )
+    started = time.perf_counter()
+    octree, report = distill(field.trained_field(), field.domain, data.training, background, settings, field.picture)
+    for message in report.messages:
+        run.say(message)
+    run.say(str(report))
+    distilled = OctreeModel(octree, run.metadata())
+    in_units = OctreeModel(run.data.frame.octree_back(copy.copy(octree)), run.metadata())
+    written = in_units.save(run.folder / run_folder.DISTILLED, config.storage)
+    run.results["distilled"] = {"seconds": time.perf_counter() - started, "leaves": octree.n_leaves,
+                                "MB": written / 1e6, "lost_on_training_views_db": report.lost_db}  # fmt: skip
+    run.results["field"] |= summary(score_views(field.picture, data.compared, background))
+    run.results["distilled"] |= summary(evaluate(distilled, data.compared, background))
+    return octree
+
+
+@dataclass(frozen=True, eq=False)
+class SplatPlan:
+    """What splats that an octree is made of will be trained on and how; bytes: of memory next to the program meanwhile."""
+
+    photographs: Photographs
+    schedule: Schedule
+    bytes: int
+
+
+def prepare_splats(run: Run) -> SplatPlan:
+    """The photographs and the schedule of splats that an octree is made of.
+
+    Raises:
+        InputError: the lens of a view cannot be undone, or they do not fit in the memory at hand.
+    """
+    from nerfvol.training.convert import LOOKS, evenly, small_cameras
+    from nerfvol.training.splat_start import make_schedule_of
+
+    dataset, settings, kept = run.data.training, run.config.splats, run.data.held_out_bytes
+    photographs = Photographs(dataset, run.background, most_bytes=photographs_bytes())
+    for message in photographs.messages:
+        run.say(message)
+    schedule = make_schedule_of(run, photographs)
+    splat_memory(dataset, photographs, schedule, settings, kept)
+    lenses = [camera.intrinsics for camera in evenly(small_cameras(dataset.cameras, dataset.scene), LOOKS)]
+    looked_at = sum(lens.width * lens.height for lens in lenses)
+    used = starting_splats_bytes(dataset, photographs, schedule, settings, kept, looked_at)
+    return SplatPlan(photographs, schedule, used)
+
+
+def start_from_splats(
+    run: Run, plan: SplatPlan, appearance: Appearance, asked: Appearance, optimise: Optimise
+) -> Octree:
+    """Trains splats; the octree of the surfaces that pictures of them show, and the scores of both among the run's results.
+
+    appearance: of the splats' photographs. asked: of the octree's: splats tell whether exposures differ, in a sixth of the
+    time that the octree would take to draw all views.
+
+    Raises:
+        InputError: no splat lies in the scene's region, or none is seen.
+    """
+    from nerfvol.training.convert import MOST_LEVEL, surfaces_of
+    from nerfvol.training.splat_start import StartingSplats, settings_of, start_splats
+
+    config, background, data = run.config, run.background, run.data
+    splats, distance = start_splats(run, plan.photographs, plan.schedule.most)
+    trainer = StartingSplats(
+        plan.photographs, splats, settings_of(config), plan.schedule, distance, background, config.seed, appearance
+    )
+    optimise(run, trainer)
+    seconds, steps = run.phase_seconds(), trainer.steps_done
+    if not asked.active and asked.due(MOMENTS[0]):
+        asked.fit(partial(small_picture, data.training, picture=trainer.picture), MOMENTS[0])
+    model = trainer.take_model({})
+    del trainer
+    started, scene = time.perf_counter(), data.training.scene
+    finest = min(MOST_LEVEL, max(config.octree.levels))
+    octree = surfaces_of(model.splats, scene, data.training.cameras, background, most_level=finest)
+    converted = OctreeModel(octree, run.metadata())
+    took = time.perf_counter() - started
+    run.say(f"{model.packed.n:,} splats became {octree.n_leaves:,} leaves in {took:.1f} s")
+    rows = {"splats": (model, seconds, None), "converted": (converted, took, octree.n_leaves)}
+    for name, (made, spent, leaves) in rows.items():
+        run.results[name] = {"seconds": spent, "leaves": leaves, "MB": made.describe()["bytes_in_memory"] / 1e6,
+                             **summary(evaluate(made, data.compared, background))}  # fmt: skip
+    run.results["splats"]["steps"] = steps
+    return_free_memory()
+    return octree
+
+
+def summary(scores: dict[str, Any]) -> dict[str, Any]:
+    """Means of the scores, without the rows."""
+    return {key: scores[key] for key in (*MEANS, "seconds_per_frame") if key in scores}

@@ -1,0 +1,182 @@
+"""What an octree begins with: which start a run takes, and splats as one (resuming and threads: test_resume.py)."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from nerfvol.config.octree import PHOTOGRAPHS_FROM_SURFACES, OctreeConfig
+from nerfvol.config.splats import SplatConfig
+from nerfvol.config.training import SPLATS_UNTIL, Config
+from nerfvol.datasets.load import load_dataset
+from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
+from nerfvol.native import native
+from nerfvol.region import SceneBounds
+from nerfvol.training import octree_start
+from nerfvol.training.appearance import Appearance
+from nerfvol.training.clock import Clock
+from nerfvol.training.memory import LOOK_BYTES, OctreePlan, gib, splat_bytes, starting_splats_bytes
+from nerfvol.training.prepare import is_simulated, load_data
+from nerfvol.training.session import Run
+from nerfvol.training.splat_schedule import make_schedule
+from nerfvol.training.splat_start import START_SHARE, START_STEPS, make_schedule_of, settings_of
+from tests.fixtures.runs import metrics_of, run_of, settings, start
+
+pytestmark = pytest.mark.skipif(native() is None, reason="the reference path takes minutes")
+BOX = np.array([[-1.0] * 3, [1.0] * 3])
+
+
+# ---------------------------------------------------------------- which start
+@pytest.mark.parametrize("views, given, expected", [
+    (17, {"time_budget": SPLATS_UNTIL}, "splats"), (17, {"time_budget": SPLATS_UNTIL + 1}, "auto"),
+    (16, {"time_budget": SPLATS_UNTIL}, "mlp"), (17, {}, "auto"), (100, {"time_budget": 1.0}, "splats"),
+    (17, {"time_budget": 20.0, "init": "direct"}, "direct"), (17, {"time_budget": 20.0, "init": "mlp"}, "mlp"),
+    (17, {"time_budget": 20.0, "representation": "splats"}, "auto"),
+    (17, {"time_budget": 20.0, "representation": "field"}, "auto"),
+    (17, {"time_budget": 20.0, "representation": "octree"}, "splats"),
+    (17, {"time_budget": 20.0, "light": "suns.json"}, "auto"),
+    (16, {"init": "splats"}, "splats"),
+])  # fmt: skip
+def test_octrees_of_objects_begin_as_splats_where_time_is_short(views, given, expected):
+    """... and views are many; what somebody chose stays."""
+    config, scene = Config(**given), SceneBounds(BOX, None, True)
+    assert config.for_views(views, scene).init == expected
+    kept = "auto" if (expected, config.init) == ("splats", "auto") else expected
+    assert config.for_views(views, scene, is_simulated=True).init == kept  # what may be a medium has no surfaces
+    assert config.for_views(views, SceneBounds(BOX, 16 * BOX, False)).init == config.init  # photographs
+
+
+@pytest.mark.parametrize("given, phases, expected", [
+    ({}, (), "auto"), ({}, ("splats", "octree"), "splats"), ({}, ("field",), "mlp"), ({}, ("octree",), "auto"),
+    ({"init": "mlp"}, ("octree",), "mlp"), ({"representation": "octree"}, ("splats",), "splats"),
+    ({"representation": "splats"}, ("splats",), "auto"), ({"representation": "field"}, ("field",), "auto"),
+])  # fmt: skip
+def test_a_resumed_run_keeps_its_start(given, phases, expected):
+    """Photographs that are trained as splats have a phase of the same name, and stay what they are."""
+    config = Config(**given, time_budget=100.0)
+    assert config.for_views(100, SceneBounds(BOX, None, True), begun=phases).init == expected
+    if phases:  # where one that is begun now would take another start
+        now = dataclasses.replace(config, time_budget=20.0)
+        assert now.for_views(100, SceneBounds(BOX, None, True), begun=phases).init == expected
+    if "representation" not in given and "init" not in given:
+        photographs = SceneBounds(BOX, 16 * BOX, False)
+        assert config.for_views(100, photographs, begun=phases).for_scene(photographs).representation == "splats"
+
+
+def test_another_budget_does_not_choose_another_start_half_way(tmp_path, tiny_scene):
+    config = settings(tiny_scene, tmp_path, time_budget=20.0)
+    run, data = run_of(config), load_data(config)
+    assert run.config.init == "splats" and run.config.representation == "octree"
+    config.time_budget = 1000.0
+    saved = {"phase": "splats", "log_bytes": 0, "results": {}, "steps": {"splats": 3}}
+    assert Run(config, data, Clock(0.0, 0.0), saved).config.init == "splats"
+    config.time_budget = 20.0
+    assert Run(config, data, Clock(0.0, 0.0), {**saved, "steps": {"octree": 3}}).config.init == "auto"
+    config.time_budget = 1000.0
+    assert Run(config, data, Clock(0.0, 0.0), None).config.init == "auto"
+
+
+@pytest.mark.parametrize("name", ["truth.npz", "provenance.json"])
+def test_what_lies_beside_simulated_images(tmp_path, name):
+    transforms = tmp_path / "transforms_train.json"
+    transforms.write_text("{}")
+    assert not is_simulated(str(tmp_path)) and not is_simulated(str(transforms))
+    (tmp_path / name).write_text("")
+    assert is_simulated(str(tmp_path)) and is_simulated(str(transforms))
+
+
+def test_the_choice_is_one_sentence():
+    assert octree_start.why_start(Config(init="direct"), 8) is None and octree_start.why_start(Config(), 8) is None
+    field, splats = (octree_start.why_start(Config(init=init, time_budget=30.0), 8) or "" for init in ("mlp", "splats"))
+    assert "only 8 training views" in field and field.startswith("start: a field, ")
+    assert splats == ("start: splats, then the octree of the surfaces that they show, for 30 s are short; "
+                      "--init direct overrules")  # fmt: skip
+
+
+@pytest.mark.parametrize("given, reason", [
+    ({"representation": "field", "init": "splats"}, "expected auto for field, got 'splats'"),
+    ({"representation": "splats", "init": "splats"}, "octree for splats, got 'splats'"),
+    ({"representation": "octree", "init": "hull"}, "expected auto, direct, mlp, splats for octree, got 'hull'"),
+])  # fmt: skip
+def test_a_start_of_another_representation_is_refused(given, reason):
+    with pytest.raises(InputError, match=reason):
+        Config(**given)
+
+
+# ---------------------------------------------------------------- splats as a start
+def test_photographs_from_surfaces_have_settings_of_their_own():
+    """As `convert` has when it trains further; what was chosen stays, and objects have what they always have."""
+    photographs, thing = SceneBounds(BOX, 16 * BOX, False), SceneBounds(BOX, None, True)
+    known = PHOTOGRAPHS_FROM_SURFACES
+    for config, expected in [
+        (Config(init="splats", representation="octree"), (known["sparsity"], known["decay_from"])),
+        (Config(init="splats", octree=OctreeConfig(sparsity=0.5)), (0.5, known["decay_from"])),
+        (Config(init="direct"), (1.2e-3, 0.35)),
+    ]:
+        octree = config.for_scene(photographs).octree
+        assert (octree.sparsity, octree.decay_from) == expected
+    assert Config(init="splats").for_scene(thing).octree == Config(init="direct").for_scene(thing).octree
+
+
+def test_they_take_a_share_of_the_time_or_few_steps(tmp_path, tiny_scene, monkeypatch):
+    monkeypatch.setattr(Run, "_time_to_finish", lambda self, phase=None: 10.0)
+    monkeypatch.setattr(Clock, "elapsed", lambda self: 10.0)
+    run = run_of(settings(tiny_scene, tmp_path, init="splats", time_budget=80.0, splats={"steps": 5000}))
+    assert settings_of(run.config).steps == START_STEPS
+    photographs = Photographs(run.data.training)
+    sizes = [(40, 40)] * 12
+    assert make_schedule_of(run, photographs) == make_schedule(START_SHARE * 60, sizes, False)
+    run = run_of(settings(tiny_scene, tmp_path, init="splats", splats={"steps": 5000}))
+    assert make_schedule_of(run, photographs) == make_schedule(START_STEPS / 80, sizes, False)
+    assert settings_of(Config(representation="octree", splats=SplatConfig(steps=3))).steps == 3
+    assert settings_of(Config(representation="splats")).steps == SplatConfig().steps
+
+
+def test_the_larger_of_both_is_announced(tiny_scene):
+    dataset = load_dataset(tiny_scene)
+    photographs, config = Photographs(dataset), SplatConfig(sh_degree=1)
+    schedule = make_schedule(20.0, [(40, 40)] * 12, False, 10**6)
+    few, many = (starting_splats_bytes(dataset, photographs, schedule, config, 77, n) for n in (1, 10**9))
+    assert few > splat_bytes(schedule, config) + dataset.nbytes + 77
+    assert many - few == LOOK_BYTES * 10**9 - splat_bytes(schedule, config)
+    plain = OctreePlan(Config().for_scene(dataset.scene), dataset, 77)
+    after = OctreePlan(Config().for_scene(dataset.scene), dataset, 77, 7 << 30)
+    assert "splats" not in plain.sentence()
+    assert f"before that {gib(7 << 30)} for splats" in after.sentence()
+    assert after.sentence().startswith(f"{gib((7 << 30) + (160 << 20))} at its peak")
+
+
+def test_an_octree_is_there_sooner_than_from_low_density(tmp_path, tiny_scene):
+    """The same 60 steps of the octree, after splats of 120: the picture is better than theirs, and by a decibel better than
+    from low density."""
+    lines = []
+    splats = settings(tiny_scene, tmp_path / "splats", init="splats", splats={"steps": 120}, checkpoint_every=1000)
+    splats, fog = (metrics_of(start(config, say=lines.append)) for config in
+                   (splats, settings(tiny_scene, tmp_path / "fog", init="direct", checkpoint_every=1000)))  # fmt: skip
+    print(splats["psnr"], fog["psnr"], splats["results"])
+    assert splats["psnr"] > fog["psnr"] + 1
+    rows = splats["results"]
+    assert (
+        list(rows) == ["splats", "converted", "fine_tuned"] and rows["fine_tuned"]["psnr"] > rows["converted"]["psnr"]
+    )
+    assert rows["splats"]["steps"] == splats["steps"]["splats"] == 120 and rows["splats"]["leaves"] is None
+    assert any(f"became {rows['converted']['leaves']:,} leaves" in line for line in lines)
+
+
+def test_where_no_splat_can_become_a_leaf_it_is_said(tmp_path, tiny_scene, monkeypatch):
+    """Splats far outside of the scene's region: one sentence, no octree."""
+    from nerfvol.training import splat_start
+
+    begin = splat_start.start_splats
+
+    def far_away(run, photographs, most):
+        splats, distance = begin(run, photographs, most)
+        splats.means[...] += 100
+        return splats, distance
+
+    monkeypatch.setattr(splat_start, "start_splats", far_away)
+    run = run_of(settings(tiny_scene, tmp_path, init="splats"))
+    plan = octree_start.prepare_splats(run)
+    with pytest.raises(InputError, match="none of the [0-9]+ splats lies in the region"):
+        octree_start.start_from_splats(run, plan, Appearance(12, "off"), Appearance(12, "off"), lambda run, phase: None)
