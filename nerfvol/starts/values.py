@@ -9,7 +9,6 @@ import numpy as np
 from nerfvol import sh as spherical
 from nerfvol.field.layout import PointField
 from nerfvol.octree.rows import DENSITY_SLOT, EMPTY_DENSITY, explin_inverse, sh_slots
-from nerfvol.octree.topology import OFFSETS
 from nerfvol.octree.tree import Octree
 from nerfvol.starts import cells
 
@@ -18,7 +17,7 @@ REACH, WIDE_REACH = 0.125, 0.25
 half as thick as a leaf that stand in the middle of it."""
 THICKEST = 20.0
 """Optical thickness of a leaf beyond which it is opaque: larger numbers change nothing and are hard to optimise."""
-_TETRAHEDRON = 2.0 * OFFSETS[OFFSETS.sum(1) % 2 == 0] - 1
+_TETRAHEDRON = 4 * cells.TETRAHEDRON - 2  # corners at -1 and 1
 _FAINT = 1e-6  # coefficient that colour counts with where there is none: empty space has its own colour, not 0 / 0
 
 
