@@ -35,8 +35,8 @@ def judged_downscale(dataset: Dataset) -> int:
 def needed(octree: Octree, dataset: Dataset, background: Sequence[float], weight: float) -> np.ndarray:
     """(n_leaves,) bool: all but leaves that :data:`ENOUGH_VIEWS` views or more have in their picture and of which no ray sees
     a share of ``weight``."""
+    judged = views_of_leaves(octree, dataset.evenly(2 * JUDGING_VIEWS)) >= ENOUGH_VIEWS
     dataset = dataset.evenly(JUDGING_VIEWS)
-    judged = views_of_leaves(octree, dataset) >= ENOUGH_VIEWS
     if weight <= 0 or not judged.any():
         return np.ones(octree.n_leaves, bool)
     return ~judged | (largest_weights(octree, dataset, background, judged_downscale(dataset)) >= weight)

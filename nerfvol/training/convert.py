@@ -22,6 +22,7 @@ from nerfvol.config.field import DistillConfig
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.dataset import evenly as even_places
 from nerfvol.datasets.frame import Frame
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
@@ -122,8 +123,7 @@ def small_cameras(cameras: Sequence[Camera], scene: SceneBounds) -> list[Camera]
 
 def evenly(items: Sequence[T], most: int) -> list[T]:
     """At most ``most`` of these, the first and the last among them."""
-    chosen = np.linspace(0, len(items) - 1, min(len(items), most)).round().astype(int)
-    return [items[i] for i in np.unique(chosen)]
+    return [items[i] for i in even_places(len(items), min(len(items), most))]
 
 
 def octree_of(
