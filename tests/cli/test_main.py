@@ -85,8 +85,8 @@ def test_no_arguments_and_version(command):
         (["train", "--data", ".", "--out", "x", "--time-budget", "soon"], "time_budget: expected a duration"),
         (
             ["train", "--data", ".", "--out", "x", "--init", "nothing"],
-            "init: expected auto, direct, mlp, splats, points, sweep, points+sweep, hull, random or a file of splats or an "
-            "octree",
+            "init: expected auto, direct, mlp, splats, points, sweep, points+sweep, hull, random or "
+            "a file of splats or an octree",
         ),
         (["train", "--data", ".", "--out", "x", "--config", "none.yaml"], "no such file: none.yaml"),
         (["train", "--data", ".", "--out", "x", "--seed", "one"], "seed: expected a whole number, got 'one'"),
