@@ -125,7 +125,7 @@ def test_a_slow_clock_reaches_the_finest_stage(tmp_path, tiny_scene, monkeypatch
     monkeypatch.setattr(finishing, "EXPECTED_SECONDS_TO_WRITE", 100.0)
     monkeypatch.setattr(OctreeTrainer, "seconds_to_write", lambda self: 100.0)
     monkeypatch.setattr(session.Run, "claim", claim_and_count(session.Run.claim, steps))
-    config = settings(tiny_scene, tmp_path, time_budget=10.0, checkpoint_every=1000)
+    config = settings(tiny_scene, tmp_path, time_budget=10.0, init="direct", checkpoint_every=1000)
     config.octree = dataclasses.replace(OctreeConfig(), **MANY, most_epochs=10**9)
     seen = []
     start(config, watch=lambda run, phase, began: seen.append(phase.stage))
