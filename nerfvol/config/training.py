@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
 SHORT_RUN = 10.0
-"""Seconds of a time budget up to which an octree does not begin as a field: distilling it would take most of them."""
+"""Seconds of a time budget up to which an octree begins with low density: distilling a field would take most of them, and
+splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2 dB)."""
 SPLATS_UNTIL = 45.0
-"""Seconds of a time budget up to which an octree of an object that many views show begins as splats: fog takes most of them to
-become surfaces. Later that costs nothing any more, and what splats left out would be missing (docs/performance.md)."""
+"""... and from there up to which that of an object that many views show begins as splats: fog takes most of them to become
+surfaces. Later that costs nothing any more, and what splats left out would be missing (docs/performance.md)."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
@@ -163,7 +164,8 @@ class Config(Checked):
         elif few:
             start = "auto" if budget is not None and budget <= SHORT_RUN else "mlp"
         else:
-            start = "splats" if budget is not None and budget <= SPLATS_UNTIL and not is_simulated else "auto"
+            is_short = budget is not None and SHORT_RUN < budget <= SPLATS_UNTIL
+            start = "splats" if is_short and not is_simulated else "auto"
         init = start if self.init == "auto" else self.init
         return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS if few else {}))
 

@@ -7,7 +7,7 @@ import pytest
 
 from nerfvol.config.octree import PHOTOGRAPHS_FROM_SURFACES, OctreeConfig
 from nerfvol.config.splats import SplatConfig
-from nerfvol.config.training import SPLATS_UNTIL, Config
+from nerfvol.config.training import SHORT_RUN, SPLATS_UNTIL, Config
 from nerfvol.datasets.load import load_dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
@@ -30,7 +30,8 @@ BOX = np.array([[-1.0] * 3, [1.0] * 3])
 # ---------------------------------------------------------------- which start
 @pytest.mark.parametrize("views, given, expected", [
     (17, {"time_budget": SPLATS_UNTIL}, "splats"), (17, {"time_budget": SPLATS_UNTIL + 1}, "auto"),
-    (16, {"time_budget": SPLATS_UNTIL}, "mlp"), (17, {}, "auto"), (100, {"time_budget": 1.0}, "splats"),
+    (16, {"time_budget": SPLATS_UNTIL}, "mlp"), (17, {}, "auto"), (100, {"time_budget": SHORT_RUN}, "auto"),
+    (100, {"time_budget": SHORT_RUN + 1}, "splats"),
     (17, {"time_budget": 20.0, "init": "direct"}, "direct"), (17, {"time_budget": 20.0, "init": "mlp"}, "mlp"),
     (17, {"time_budget": 20.0, "representation": "splats"}, "auto"),
     (17, {"time_budget": 20.0, "representation": "field"}, "auto"),
