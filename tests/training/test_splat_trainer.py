@@ -286,7 +286,8 @@ def test_which_representation_suits(alpha, init, expected):
     (8, True, {"representation": "splats"}, "auto", 6e-5), (8, True, {"representation": "field"}, "auto", 6e-5),
     (8, True, {"octree": OctreeConfig(tv_sh=0.5)}, "mlp", None),
     (8, True, {"time_budget": 10.0}, "auto", 3e-4), (8, True, {"time_budget": 11.0}, "mlp", 3e-4),
-    (8, True, {"time_budget": 9.0, "init": "mlp"}, "mlp", 3e-4), (100, True, {"time_budget": 9.0}, "auto", 6e-5), (100, True, {"time_budget": 20.0}, "splats", 6e-5),
+    (8, True, {"time_budget": 9.0, "init": "mlp"}, "mlp", 3e-4), (100, True, {"time_budget": 9.0}, "auto", 6e-5),
+    (100, True, {"time_budget": 20.0}, "splats", 6e-5),
 ])  # fmt: skip
 def test_objects_of_few_views_begin_as_fields_where_there_is_time(views, alpha, given, start, tv):
     """Where nobody says otherwise; what somebody chose stays."""
