@@ -180,7 +180,7 @@ class Tree:
         blocks = len(self.leaves) + sum(float(np.prod(counts)) for _, counts, _ in tiles)
         bricks = float(np.prod(-(-(last - first).astype(float) // 8)))
         self._refuse(last - first, 2048.0 * self.channels * blocks + 24.0 * bricks, "blocks")
-        corners = [np.array(self.leaves).reshape(-1, 3)]
+        corners = [np.array(self.leaves, np.int64).reshape(-1, 3)]
         values = [self.values.reshape(-1, 8, 8, 8, *self.values.shape[2:])]
         for start, counts, value in tiles:
             corners.append(8 * np.stack(np.unravel_index(np.arange(int(np.prod(counts))), counts), axis=1) + start)

@@ -8,6 +8,7 @@ import pytest
 
 from data_synth import media, scenes
 from data_synth.blosc import decompress
+from data_synth.bricks import bricks
 from data_synth.errors import InputError, RenderWarning
 from data_synth.vdb import Reader, Tree, read_vdb
 from data_synth.vdb_write import SparseGrid, write_grids, write_vdb
@@ -345,6 +346,17 @@ def test_a_real_file_reads_exactly():
     with np.load(folder / "smoke_dense_f32.npz") as dense:
         assert np.array_equal(grid.values, dense["density"]) and np.array_equal(grid.first, dense["ijk_min"])
         assert np.allclose(grid.voxel_size, dense["voxel_size"])
+
+
+def test_a_grid_of_tiles_alone_is_cut_to_bricks():
+    """Without any leaf its blocks' places were no whole numbers, and synth ended in a TypeError."""
+    tree = Tree(Reader(struct.pack("<fII", 0.0, 0, 0), "tiles.vdb"), flags=0, half=False)
+    tree.values, tree.active = np.zeros((0, 512), np.float32), np.zeros((0, 512), bool)
+    tree.boxes = [(np.array([8, -16, 0]), 8, 0.25), (np.array([8, 0, 16]), 8, 0.5)]
+    first, volume = tree.sparse()
+    assert first.tolist() == [8, -16, 0] and volume.size == (8, 24, 24)
+    total = bricks(volume).samples.reshape(-1, 9, 9, 9)[:, :8, :8, :8].sum()
+    assert total == pytest.approx(512 * 0.75)
 
 
 def test_voxels_far_apart_and_grids_that_end_before_they_begin(tmp_path):
