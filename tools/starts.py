@@ -49,6 +49,8 @@ def on_cpu_clock(argv: list[str]) -> None:
 def subset(data: Path, out: Path, n: int) -> Path:
     """A folder of ``data`` with n of its training views, evenly chosen; made once."""
     listed: dict[str, Any] = json.loads((data / "transforms_train.json").read_text())
+    if n > len(listed["frames"]):
+        raise SystemExit(f"starts: --views: {data} has {len(listed['frames'])} training views, got {n}")
     every = len(listed["frames"]) // n
     folder = out / f"{data.name}_{n}"
     folder.mkdir(parents=True, exist_ok=True)
