@@ -16,6 +16,7 @@ from typing import Any
 from nerfvol.config.octree import FINEST_LEVEL
 from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
+from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
@@ -104,14 +105,16 @@ def prepare_splats(run: Run) -> SplatPlan:
 
 def start_from_splats(
     run: Run, plan: SplatPlan, appearance: Appearance, asked: Appearance, optimise: Optimise
-) -> Octree:
+) -> Octree | None:
     """Trains splats; the octree of the surfaces that pictures of them show, and the scores of both among the run's results.
+
+    None, with a sentence, where nobody asked for splats and they show no surfaces: low density is left to begin with.
 
     appearance: of the splats' photographs. asked: of the octree's: splats tell whether exposures differ, in a sixth of the
     time that the octree would take to draw all views.
 
     Raises:
-        InputError: no splat lies in the scene's region, or none is seen.
+        InputError: splats were asked for, and none lies in the scene's region, or none is seen.
     """
     from nerfvol.training.convert import MOST_LEVEL, surfaces_of
     from nerfvol.training.splat_start import StartingSplats, settings_of, start_splats
@@ -129,7 +132,13 @@ def start_from_splats(
     del trainer
     started, scene = time.perf_counter(), data.training.scene
     finest = min(MOST_LEVEL, max(config.octree.levels))
-    octree = surfaces_of(model.splats, scene, data.training.cameras, background, most_level=finest)
+    try:
+        octree = surfaces_of(model.splats, scene, data.training.cameras, background, most_level=finest)
+    except InputError as error:
+        if run.given.init != "auto":
+            raise
+        run.say(f"start: low density, for the splats became no octree: {error}")
+        return None
     converted = OctreeModel(octree, run.metadata())
     took = time.perf_counter() - started
     run.say(f"{model.packed.n:,} splats became {octree.n_leaves:,} leaves in {took:.1f} s")

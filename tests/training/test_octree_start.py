@@ -1,6 +1,7 @@
 """What an octree begins with: which start a run takes, and splats as one (resuming and threads: test_resume.py)."""
 
 import dataclasses
+import time
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
-from nerfvol.training import octree_start
+from nerfvol.training import convert, octree_start, train
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.clock import Clock
 from nerfvol.training.memory import LOOK_BYTES, OctreePlan, gib, splat_bytes, starting_splats_bytes
@@ -181,3 +182,20 @@ def test_where_no_splat_can_become_a_leaf_it_is_said(tmp_path, tiny_scene, monke
     plan = octree_start.prepare_splats(run)
     with pytest.raises(InputError, match="none of the [0-9]+ splats lies in the region"):
         octree_start.start_from_splats(run, plan, Appearance(12, "off"), Appearance(12, "off"), lambda run, phase: None)
+
+
+@pytest.mark.parametrize("init", ["auto", "splats"])
+def test_splats_that_show_no_surfaces_leave_low_density(tmp_path, tiny_scene, monkeypatch, init):
+    """... where they were chosen, not asked for."""
+
+    def nothing(*arguments, **settings):
+        raise InputError("no splat is seen")
+
+    monkeypatch.setattr(convert, "surfaces_of", nothing)
+    said, config = [], settings(tiny_scene, tmp_path, time_budget=20.0, init=init)
+    if init == "splats":
+        with pytest.raises(InputError, match="no splat is seen"):
+            train.train(config, started=time.perf_counter() - 100, say=said.append)
+    else:
+        assert train.train(config, started=time.perf_counter() - 100, say=said.append) is not None
+        assert any("low density, for the splats became no octree: no splat is seen" in sentence for sentence in said)
