@@ -215,6 +215,7 @@ MUTANTS = (
     M("data_synth/scene_file.py", "if key.value in keys[:k]:", "if False:", "data_synth/test_scene_file.py", "keys a second time in scene files"),
     # ---------------------------------------------------------------- kernels, second values
     M("nerfvol/kernels/csrc/distil.cpp", "std::abs(between - own[p]) * share[p]", "std::abs(between - own[p])", "octree/test_merge.py", "colours of what is invisible keep leaves"),
+    M("nerfvol/kernels/csrc/field_march.h", "high[axis] = float(most[axis] + 1) * 2", "high[axis] = float(most[axis] - 1) * 2", "kernels/test_field_march.py", "rays are cut to a box that ends inside of what is occupied"),
     M("nerfvol/kernels/csrc/distil.cpp", "for (int z = c[2] - 1; z <= c[2] + 1; ++z)", "for (int z = c[2] - 1; z <= c[2]; ++z)", "starts/test_field.py", "neighbours on one side"),
     M("nerfvol/kernels/csrc/neighbours.cpp", "if (across * across <= found.worst()) find", "if (across * across <= 0.5 * found.worst()) find", "splats/test_ply.py starts", "the nearest behind a split"),
     # ---------------------------------------------------------------- media under known suns
@@ -262,6 +263,7 @@ MUTANTS = (
     M("nerfvol/starts/exposures.py", "1.4826 * float(np.median(np.abs(left.mean(1))))", "float(left.std())", EXPOSURES, "one pair in a shadow makes all doubtful"),
     M("nerfvol/starts/exposures.py", "< COVERED * n", "< 0", EXPOSURES, "what shares nothing is compared"),
     M("nerfvol/training/train.py", "left >= MEASURED_FROM * len(dataset)", "left >= 0", "training/test_appearance.py", "seconds that a run does not have measure exposures"),
+    M("nerfvol/training/octree_start.py", "level=level_in_time(finest, run.seconds_left())", "level=finest", "training/test_budget.py::test_a_short_run_distils_coarser", "a run without the time distils at the finest level"),
     M("nerfvol/config/training.py", "< budget <= SPLATS_UNTIL", "< budget < SPLATS_UNTIL", "training/test_octree_start.py", "the budget at which octrees begin as splats no more"),
     M("nerfvol/config/training.py", " and not is_simulated else", " else", "training/test_octree_start.py", "media begin as surfaces"),
     M("nerfvol/config/training.py", "        if begun:\n", "        if False:\n", "training/test_octree_start.py", "another budget changes a resumed run's start"),

@@ -220,6 +220,13 @@ class Occupancy:
         """The largest optical thickness of a cell."""
         return float((self.sigmas.reshape(self.cubes, -1).max(1) * self.cell_edges).max())
 
+    def held(self) -> NDArray[np.int64]:
+        """(n,) numbers of the occupied cells, in order."""
+        words = np.flatnonzero(self.occupied)
+        bits = np.flatnonzero(np.unpackbits(self.occupied[words].view(np.uint8), bitorder="little").view(bool))
+        cells = 64 * words[bits >> 6] + (bits & 63)
+        return cells[cells < len(self.sigmas)]
+
     def cells(self) -> NDArray[np.bool_]:
         """(cubes, r, r, r) whether each cell is occupied."""
         bits = np.unpackbits(self.occupied.view(np.uint8), bitorder="little")[: len(self.sigmas)]
@@ -230,14 +237,19 @@ class Occupancy:
         """Occupied share of the cells of the inner cube."""
         return float(self.cells()[0].mean())
 
-    def positions(self, cells: NDArray[np.int64], inside: NDArray[np.float64], size: int = 1) -> Float:
+    def positions(self, cells: NDArray[np.int64], inside: Float, size: int = 1) -> Float:
         """Scene positions (n, 3) of points at ``inside`` (n, 3) in [0, 1) of blocks of size**3 cells, of which ``cells`` (n,)
         is the lowest."""
         r = self.resolution
-        cube, within = cells // r**3, cells % r**3
-        ijk = np.stack([within // r**2, within // r % r, within % r], axis=1)
-        unit = ((ijk + inside * size) / r * 2 - 1) * (2.0**cube)[:, None]
-        return (unit * self.domain.half + np.asarray(self.domain.center)).astype(np.float32)
+        out = np.multiply(inside, size, dtype=np.float32)
+        within = (cells % r**3).astype(np.int32)
+        for axis, stride in enumerate((r * r, r, 1)):
+            out[:, axis] += within // stride % r
+        out *= 2 / r
+        out -= 1
+        out *= (self.domain.half * 2.0 ** (cells // r**3)).astype(np.float32)[:, None]
+        out += np.array(self.domain.center, np.float32)
+        return out
 
     def note(self, cells: NDArray[np.int64], sigmas: Float, decay: float = 0.8) -> None:
         """A cell that was looked at keeps max(decay * old, largest seen); cells may repeat."""
@@ -247,9 +259,16 @@ class Occupancy:
     def note_blocks(self, sigmas: Float, decay: float = 0.8) -> None:
         """The same of all cells at once: ``sigmas`` (cubes * (r / 2)**3,) was seen in each block of 2**3 cells."""
         r = self.resolution
-        of_cells = self.sigmas.reshape(self.cubes, r // 2, 2, r // 2, 2, r // 2, 2)
+        of_cells = self.sigmas.reshape(self.cubes, r // 2, 2, r // 2, 2, r)  # whole rows: loops of two are slow
         of_cells *= np.float32(decay)
-        np.maximum(of_cells, sigmas.reshape(self.cubes, r // 2, 1, r // 2, 1, r // 2, 1), out=of_cells)
+        rows = np.repeat(sigmas, 2).reshape(self.cubes, r // 2, 1, r // 2, 1, r)
+        np.maximum(of_cells, rows, out=of_cells)
+
+    def blocks(self) -> NDArray[np.int64]:
+        """(cubes * (r / 2)**3,) the lowest cell of each block of 2**3, in order."""
+        r = self.resolution
+        cube, place = np.arange(self.cubes)[:, None, None, None], np.arange(0, r, 2)
+        return (cube * r**3 + place[:, None, None] * r**2 + place[:, None] * r + place).reshape(-1)
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps, not copied: sigmas, occupied, coarse."""

@@ -142,7 +142,9 @@ class CompiledFieldTrainer:
         """See Phase: where it is the product, what a picture takes follows from the occupied cells, in powers of two."""
         if not self.final:
             return f"{self.parameter_bytes // 4:,} parameters"
-        cells = int(np.unpackbits(self.occupancy.coarse.view(np.uint8)).sum()) * COARSE**3
+        cells = (
+            int.from_bytes(self.occupancy.coarse.tobytes(), "little").bit_count() * COARSE**3
+        )  # asked for at every step
         return f"{self.parameter_bytes // 4:,} parameters, about {2 ** round(math.log2(max(1, cells))):,} cells"
 
     def seconds_to_write(self) -> float:

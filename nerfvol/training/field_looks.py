@@ -32,31 +32,28 @@ def look(state: FieldState, grid: Occupancy, seed: int, step: int) -> None:
     Raises:
         InputError: nothing is left.
     """
-    r = grid.resolution
     rng = np.random.Generator(np.random.Philox(key=[seed, 1 + step]))
 
     def seen(cells: np.ndarray, size: int) -> np.ndarray:
-        positions = grid.positions(cells, rng.random((len(cells), 3)), size)
+        positions = grid.positions(cells, rng.random((len(cells), 3), np.float32), size)
         return field_ops.evaluate(state, positions, values=False)[0]
 
     if step in SWEEPS:
-        blocks = np.stack(np.unravel_index(np.arange(grid.cubes * (r // 2) ** 3), (grid.cubes, *[r // 2] * 3)), 1)
-        low = np.ravel_multi_index((blocks[:, 0], *(2 * blocks[:, 1:].T)), (grid.cubes, r, r, r))
-        grid.note_blocks(seen(low, 2))
+        grid.note_blocks(seen(grid.blocks(), 2))
     elif step in THINNED:
-        held = np.flatnonzero(grid.cells().reshape(-1))
+        held = grid.held()
         apart = -(-len(held) // MOST_LOOKED)
         held = held[rng.integers(apart) :: apart]
         grid.note(held, seen(held, 1), THIN_DECAY)
     elif step > SWEEPS[-1] and step % PROBE_EVERY == 0:
-        held = np.flatnonzero(grid.cells().reshape(-1))
+        held = grid.held()
         anywhere = rng.integers(len(grid.sigmas), size=PROBES // 2)
         cells = np.concatenate([anywhere, held[rng.integers(len(held), size=PROBES // 2)]])
         grid.note(cells, seen(cells, 1))
     else:
         return
     grid.refresh()
-    if grid.thickest() < 1 / (255 * math.sqrt(3) * r):  # a whole ray would not change an 8-bit colour
+    if grid.thickest() < 1 / (255 * math.sqrt(3) * grid.resolution):  # a whole ray would not change an 8-bit colour
         raise InputError(
             "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
             "the images' background and that the scene bounds contain the object, lower field.rate, or start with "

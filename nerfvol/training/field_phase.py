@@ -19,8 +19,14 @@ NEAREST = 0.05
 """Sample to a camera among photographs, in units of half the inner cube's edge."""
 FIELD_SHARE = 0.3
 """Of the time left in a run, the most that the field gets."""
-SECONDS_TO_DISTILL = 2.0
-"""Kept for the end of a run while a field is trained: what an octree takes to be written."""
+SECONDS_TO_DISTILL = 5.0
+"""What distilling at DISTILLED_LEVEL takes on two slow cores, of a field of an object; each level coarser a quarter of it."""
+DISTILLED_LEVEL = 8
+DISTILLING_SHARE = 0.4
+"""Of the time that is left after a field, the most that distilling may take: a level is worth 0.15 dB before the octree is
+trained, which finds it again."""
+COARSEST_DISTILLED = 6
+"""Below this, what is lost would not be found again in so short a time."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +41,17 @@ class FieldReport(StepReport):
     def psnr(self) -> float:
         """Of the batch, dB."""
         return -10 * math.log10(max(self.squared_error, 1e-12))
+
+
+def level_in_time(finest: int, left: float | None) -> int:
+    """The level, at most ``finest``, that a field is distilled at with ``left`` seconds to go, None: no matter. A field of a
+    second is haze, and takes more than what is reckoned with here rather than less."""
+    level = finest
+    while left is not None and level > COARSEST_DISTILLED:
+        if SECONDS_TO_DISTILL * 4.0 ** (level - DISTILLED_LEVEL) <= DISTILLING_SHARE * left:
+            break
+        level -= 1
+    return level
 
 
 def domain_of(scene: SceneBounds) -> Domain:

@@ -23,6 +23,7 @@ from nerfvol.machine import return_free_memory
 from nerfvol.measure.scores import MEANS, evaluate, score_views
 from nerfvol.octree.tree import Octree
 from nerfvol.training.appearance import MOMENTS, Appearance, small_picture
+from nerfvol.training.field_phase import level_in_time
 from nerfvol.training.field_start import make_field_trainer
 from nerfvol.training.memory import photographs_bytes, splat_memory, starting_splats_bytes
 from nerfvol.training.phase import Phase
@@ -55,9 +56,10 @@ def start_from_field(run: Run, optimise: Optimise) -> Octree:
     optimise(run, field)
     run.results["field"] = {"seconds": run.phase_seconds(), "steps": field.steps_done, "leaves": None,
                             "MB": field.parameter_bytes / 1e6}  # fmt: skip
-    settings = dataclasses.replace(
-        config.distill, level=min(config.distill.level or FINEST_LEVEL, max(config.octree.levels))
-    )
+    finest = min(config.distill.level or FINEST_LEVEL, max(config.octree.levels))
+    settings = dataclasses.replace(config.distill, level=level_in_time(finest, run.seconds_left()))
+    if settings.level != finest:
+        run.say(f"the field is distilled at level {settings.level} instead of {finest}, for which there is no time")
     started = time.perf_counter()
     octree, report = distill(field.trained_field(), field.domain, data.training, background, settings, field.picture)
     for message in report.messages:

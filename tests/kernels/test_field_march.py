@@ -92,6 +92,17 @@ def test_notes_of_blocks_are_those_of_their_cells():
     assert np.array_equal(grids[0].sigmas, grids[1].sigmas)
 
 
+def test_occupied_cells_and_blocks_are_numbered_in_order(compiled):
+    """Of several cubes, the largest last; blocks by their lowest cell."""
+    grid = fields.scattered(fields.OUTSIDE, share=0.05).occupancy
+    assert 0 < len(grid.held()) < len(grid.sigmas)
+    assert np.array_equal(grid.held(), np.flatnonzero(grid.cells().reshape(-1)))
+    few = Occupancy(fields.OUTSIDE, 4)
+    assert np.array_equal(few.held(), np.arange(len(few.sigmas)))
+    lowest = [n for n, (x, y, z) in enumerate(np.ndindex(few.cubes * 4, 4, 4)) if not (x % 2 or y % 2 or z % 2)]
+    assert few.blocks().tolist() == lowest
+
+
 def test_notes_keep_the_largest_of_repeated_cells():
     grid = Occupancy(fields.INSIDE, 8)
     grid.sigmas[5] = 10

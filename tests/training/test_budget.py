@@ -15,7 +15,7 @@ from nerfvol.datasets.dataset import evenly
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
-from nerfvol.training import clock, field_trainer, finishing, octree_end, prepare, session, splat_start
+from nerfvol.training import clock, field_phase, field_trainer, finishing, octree_end, prepare, session, splat_start
 from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory import OctreePlan, gib, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
@@ -60,6 +60,35 @@ def test_a_field_leaves_most_of_the_time_to_the_octree(tiny_scene):
     """At most its own bound, and never so much that nothing is left."""
     field = FieldTrainer(load_dataset(tiny_scene), FieldConfig(time_budget=7.0))
     assert field.share_of(1000.0) == 7.0 and 0 < field.share_of(10.0) < 5.0
+
+
+@pytest.mark.parametrize("left, level", [(None, 8), (100.0, 8), (12.6, 8), (12.4, 7), (3.2, 7), (3.0, 6), (0.0, 6)])
+def test_a_field_is_distilled_as_fine_as_there_is_time_for(left, level):
+    """5 s at level 8 and a quarter at each coarser one, in 0.4 of what is left; never coarser than 6, nor finer than asked."""
+    assert field_phase.level_in_time(8, left) == level
+    assert field_phase.level_in_time(5, left) == 5
+
+
+@pytest.mark.parametrize("budget, level", [(40.0, 8), (10.0, 7)])
+def test_a_short_run_distils_coarser(tmp_path, tiny_scene, monkeypatch, budget, level):
+    """By a clock that stands still between two looks of 20 ms: after the field 24 and 6 s are left for all else."""
+    looks, asked = iter(range(10**9)), []
+
+    class Distilled(Exception):
+        pass
+
+    def distill(field, domain, dataset, background, config, *more):
+        asked.append(config.level)
+        raise Distilled
+
+    monkeypatch.setattr(session.Clock, "elapsed", lambda self: 0.02 * next(looks))
+    monkeypatch.setattr("nerfvol.starts.field.distill", distill)
+    config = settings(tiny_scene, tmp_path, init="mlp", time_budget=budget, checkpoint_every=1000)
+    config.octree.levels, config.distill.level = (4, 5, 8), None
+    config.field.steps = 10**9
+    with pytest.raises(Distilled):
+        start(config)
+    assert asked == [level]
 
 
 def test_a_budget_ends_early_where_more_steps_would_overfit(tmp_path, tiny_scene, monkeypatch):

@@ -21,10 +21,11 @@ uint64_t mixed(uint64_t x) {
 // The larger of each cell and its two neighbours along one axis.
 void dilate(std::vector<uint8_t>& cells, int n, int stride) {
     std::vector<uint8_t> out(cells);
-    for (int i = 0; i < n * n * n; ++i) {
-        const int place = i / stride % n;
-        if (place > 0) out[std::size_t(i)] |= cells[std::size_t(i - stride)];
-        if (place < n - 1) out[std::size_t(i)] |= cells[std::size_t(i + stride)];
+    const int line = stride * n;
+    for (int from = 0; from < n * n * n; from += line) {
+        uint8_t *to = out.data() + from, *at = cells.data() + from;
+        for (int i = 0; i < line - stride; ++i) to[i] |= at[i + stride];
+        for (int i = stride; i < line; ++i) to[i] |= at[i - stride];
     }
     cells.swap(out);
 }
@@ -116,7 +117,7 @@ void refresh_occupancy(const float* sigmas, int cubes, int resolution, const flo
         });
         for (int stride : {1, c, c * c}) dilate(pooled, c, stride);
         pack(pooled, int64_t(cube) * c * c * c, coarse);
-        before = cells;
+        if (cube + 1 < cubes) before = cells;
     }
 }
 
