@@ -19,6 +19,8 @@ Source: restriction as the transpose of interpolation, Briggs, Henson & McCormic
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -51,8 +53,16 @@ def prefiltered_nodes(octree: Octree) -> PrefilteredNodes:
     array ``octree.values`` is not noticed: set ``octree.prefiltered`` to None then.
     """
     if octree.prefiltered is None:
-        octree.prefiltered = _prefilter(octree)
+        octree.prefiltered = _prefilter(octree) if (compiled := native()) is None else _compiled(compiled, octree)
     return octree.prefiltered
+
+
+def _compiled(compiled: ModuleType, octree: Octree) -> PrefilteredNodes:
+    """What :func:`_prefilter` makes, by csrc/prefilter.cpp, which a page calls as well."""
+    masks, first = (octree.node_mask, octree.leaf_mask), (octree.first_node, octree.first_leaf)
+    place = [float(x) for x in octree.origin], float(octree.size), float(octree.density_scale)
+    tree = compiled.Tree(*masks, *first, octree.corners, octree.values, octree.sh_degree, *place, None, None, 0.0)
+    return PrefilteredNodes(*compiled.prefilter(tree))
 
 
 def _prefilter(octree: Octree) -> PrefilteredNodes:
@@ -84,11 +94,11 @@ def _prefilter(octree: Octree) -> PrefilteredNodes:
         below = corners, rows, extinction
         corners_of_level.append(corners)
         rows_of_level.append(rows)
-    corners_of_level, rows_of_level = corners_of_level[::-1], rows_of_level[::-1]
     values = aligned_empty((sum(map(len, rows_of_level)), octree.values.shape[1]), np.float32)
     np.concatenate(rows_of_level, out=values)
     first_row = np.cumsum([0, *map(len, rows_of_level)])
-    corners = np.concatenate([c + np.int32(first) for c, first in zip(corners_of_level, first_row, strict=False)])
+    of_level = [c + np.int32(first) for c, first in zip(corners_of_level, first_row, strict=False)]
+    corners = np.concatenate(of_level[::-1])  # nodes from the root down, rows from the finest level up
     return PrefilteredNodes(corners, values)
 
 
@@ -127,9 +137,6 @@ def _restrict(
     mask: np.ndarray, first: np.ndarray, corners: np.ndarray, rows: np.ndarray, weight: np.ndarray, sums: np.ndarray
 ) -> None:
     """Adds to ``sums`` (n, 8, row) what the children named by ``mask`` (n,) hold; see csrc/topology.h."""
-    if (compiled := native()) is not None:
-        compiled.restrict_cells(mask, first, corners, rows, weight, DENSITY_SLOT, sums)
-        return
     for o in range(8):
         node = np.flatnonzero(mask >> o & 1)
         child = corners[first[node] + POPCOUNT[mask[node] & ((1 << o) - 1)]]

@@ -14,6 +14,7 @@
 #include "arrays.h"
 #include "batch.h"
 #include "pool.h"
+#include "prefilter.h"
 #include "field_bindings.h"
 #include "splat_bindings.h"
 #include "topology.h"
@@ -227,14 +228,17 @@ void py_interpolate(Rows rows, In<int32_t, nb::shape<-1, 8>> corners, In<int32_t
                 out.data());
 }
 
-void py_restrict_cells(In<uint8_t, nb::ndim<1>> mask, In<int32_t, nb::ndim<1>> first, In<int32_t, nb::shape<-1, 8>> corners,
-                       Rows rows, In<float, nb::ndim<1>> weight, int64_t density, Out<float, nb::shape<-1, 8, -1>> sums) {
-    if (sums.shape(0) != mask.shape(0) || first.shape(0) != mask.shape(0) || sums.shape(2) != rows.shape(1) ||
-        weight.shape(0) != rows.shape(0) || density < 0 || density >= int64_t(rows.shape(1)))
-        throw std::invalid_argument("the sums do not fit the nodes or the rows");
-    nb::gil_scoped_release release;
-    restrict_cells(mask.data(), first.data(), int64_t(mask.shape(0)), corners.data(), rows.data(), int64_t(rows.shape(1)),
-                   weight.data(), density, sums.data());
+// Corners (n_nodes, 8) and values (rows, row) of prefiltered nodes, arrays that own what they show.
+nb::tuple py_prefilter(const TreeArrays& t) {
+    auto* const made = new Prefiltered;
+    const nb::capsule owner(made, [](void* p) noexcept { delete static_cast<Prefiltered*>(p); });
+    {
+        nb::gil_scoped_release release;
+        *made = prefilter(t.tree);
+    }
+    const size_t row = 16 * size_t(t.tree.blocks);
+    return nb::make_tuple(nb::ndarray<nb::numpy, int32_t>(made->corners.data(), {size_t(t.tree.n_nodes), 8}, owner),
+                          nb::ndarray<nb::numpy, float>(made->values.data(), {made->values.size() / row, row}, owner));
 }
 
 void py_gather_tiles(const std::vector<In<float, nb::shape<-1, 64, 3>>>& directions,
@@ -323,7 +327,7 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("renumber_corners", &py_renumber_corners, "corners"_a, "kept"_a, "n_vertices"_a, "ids"_a);
     m.def("find_sources", &py_find_sources, "corners"_a, "parent"_a, "octant"_a, "source"_a, "place"_a);
     m.def("interpolate", &py_interpolate, "rows"_a, "corners"_a, "source"_a, "place"_a, "out"_a);
-    m.def("restrict_cells", &py_restrict_cells, "mask"_a, "first"_a, "corners"_a, "rows"_a, "weight"_a, "density"_a, "sums"_a);
+    m.def("prefilter", &py_prefilter, "tree"_a);
     m.def("gather_tiles", &py_gather_tiles, "directions"_a, "pixels"_a, "rotations"_a, "image"_a, "tile"_a, "row"_a, "out"_a, "target"_a);
     bind_splats(m);
     bind_fields(m);

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "pool.h"
 #include "topology.h"
 
 namespace nerfvol {
@@ -10,10 +11,18 @@ namespace {
 
 constexpr float kOpaque = 1 - 1e-6f;       // lod.OPAQUE
 constexpr float kClearest = 1e-12f;        // lod.CLEAREST
-constexpr int kDensity = 12, kFewNodes = 512;
+constexpr int kDensity = 12, kFewNodes = 256, kAtOnce = 16;  // nodes of a task, tasks whose sums wait to be added
 
 float explin(float raw) { return raw < 1 ? std::exp(raw - 1) : raw; }
 float explin_inverse(float value) { return value < 1 ? std::log(value) + 1 : value; }
+
+// Calls f(i) for every i in [0, n).
+template <class F> void in_parallel(int64_t n, const F& f) {
+    constexpr int64_t kChunk = 8192;
+    parallel_for(int((n + kChunk - 1) / kChunk), [&](int chunk, int) {
+        for (int64_t i = chunk * kChunk; i < n && i < (chunk + 1) * kChunk; ++i) f(i);
+    });
+}
 
 // The nodes of one level: where they are, and what they are drawn with.
 struct Level {
@@ -113,7 +122,7 @@ template <class Number> struct Cells {
 Prefiltered prefilter(const Tree& t) {
     const int64_t row = 16 * t.blocks;
     std::vector<float> sigma(static_cast<size_t>(t.n_vertices));
-    for (size_t v = 0; v < sigma.size(); ++v) sigma[v] = t.density_scale * explin(t.values[row * int64_t(v) + kDensity]);
+    in_parallel(t.n_vertices, [&](int64_t v) { sigma[size_t(v)] = t.density_scale * explin(t.values[row * v + kDensity]); });
     std::vector<Level> levels = place_nodes(t);
     Prefiltered out;
     out.corners.resize(size_t(8 * t.n_nodes));
@@ -135,32 +144,34 @@ Prefiltered prefilter(const Tree& t) {
             below.weigh(int64_t(next.extinction.size()), 0, next.end - next.start, side);
         }
         level.rows.assign(size_t(n_vertices * row), 0);
-        std::vector<float> nodes(size_t(n_vertices), 0), sums;
-        std::vector<float> of_corners(64 * kFewNodes);
-        float (*const depths)[8][8] = reinterpret_cast<float (*)[8][8]>(of_corners.data());
-        for (int64_t first = 0; first < n; first += kFewNodes) {
-            const int64_t few = std::min<int64_t>(kFewNodes, n - first);
-            sums.assign(size_t(8 * few * row), 0);
-            std::fill(of_corners.begin(), of_corners.end(), 0.0f);
-            leaves.add(level.start + first, few, side, row, sums.data(), depths);
-            if (parents) below.add(level.start + first, few, side, row, sums.data(), depths);
-            for (int64_t i = 0; i < few; ++i) {
-                share_out(optical_depth(depths[i]), sums.data() + 8 * row * i, row);
-                for (int c = 0; c < 8; ++c) {
-                    const int32_t v = level.corners[size_t(8 * (first + i) + c)];
-                    ++nodes[size_t(v)];
-                    for (int64_t k = 0; k < row; ++k) level.rows[size_t(row * v + k)] += sums[size_t(row * (8 * i + c) + k)];
-                }
+        std::vector<float> nodes(size_t(n_vertices), 0), all(size_t(kAtOnce * kFewNodes * 8 * row));
+        for (int64_t first = 0; first < n; first += kAtOnce * kFewNodes) {
+            const int64_t end = std::min<int64_t>(n, first + kAtOnce * kFewNodes);
+            parallel_for(int((end - first + kFewNodes - 1) / kFewNodes), [&](int task, int) {
+                const int64_t from = first + task * kFewNodes, few = std::min<int64_t>(kFewNodes, end - from);
+                float* const sums = all.data() + 8 * row * (from - first);
+                std::fill_n(sums, 8 * row * few, 0.0f);
+                std::vector<float> of_corners(size_t(64 * few), 0.0f);
+                float (*const depths)[8][8] = reinterpret_cast<float (*)[8][8]>(of_corners.data());
+                leaves.add(level.start + from, few, side, row, sums, depths);
+                if (parents) below.add(level.start + from, few, side, row, sums, depths);
+                for (int64_t i = 0; i < few; ++i) share_out(optical_depth(depths[i]), sums + 8 * row * i, row);
+            });
+            for (int64_t i = 8 * first; i < 8 * end; ++i) {  // in order: nodes share vertices
+                const int64_t v = level.corners[size_t(i)];
+                const float* const from = all.data() + row * (i - 8 * first);
+                ++nodes[size_t(v)];
+                for (int64_t k = 0; k < row; ++k) level.rows[size_t(row * v + k)] += from[k];
             }
         }
         level.extinction.resize(size_t(n_vertices));
-        for (int64_t v = 0; v < n_vertices; ++v) {
+        in_parallel(n_vertices, [&](int64_t v) {
             float* r = level.rows.data() + row * v;
             const float total = r[kDensity], opacity = std::min(total / nodes[size_t(v)], kOpaque);
             for (int64_t k = 0; k < row; ++k) r[k] /= std::max(total, 1.17549435e-38f);
             level.extinction[size_t(v)] = -std::log1p(-opacity) / side;
             r[kDensity] = explin_inverse(std::max(level.extinction[size_t(v)] / t.density_scale, kClearest));
-        }
+        });
         const int32_t base = int32_t(out.values.size() / size_t(row));
         for (int64_t i = 0; i < 8 * n; ++i) out.corners[size_t(8 * level.start + i)] = base + level.corners[size_t(i)];
         if (out.values.empty()) out.values.reserve(level.rows.size() * 3 / 2);  // the finest level has most of them

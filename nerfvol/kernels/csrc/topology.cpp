@@ -138,28 +138,25 @@ void restrict_cells(const uint8_t* mask, const int32_t* first, int64_t n, const 
                     const float* weight, int64_t density, float* sums) {
     float weights[27][8];
     lattice_weights(weights);
-    constexpr int64_t kChunk = 1024;
-    parallel_for(int((n + kChunk - 1) / kChunk), [&](int chunk, int) {
-        std::vector<float> row(std::size_t(width), 0.0f);
-        for (int64_t node = chunk * kChunk; node < n && node < (chunk + 1) * kChunk; ++node) {
-            const int32_t* child = corners + 8 * int64_t(first[node]);
-            for (int octant = 0; octant < 8; ++octant) {
-                if (!(mask[node] >> octant & 1)) continue;
-                for (int c = 0; c < 8; ++c) {
-                    const int64_t v = child[c];
-                    for (int64_t k = 0; k < width; ++k) row[std::size_t(k)] = weight[v] * rows[width * v + k];
-                    row[std::size_t(density)] = weight[v];
-                    for (int o = 0; o < 8; ++o) {
-                        const float w = 0.125f * weights[lattice_place(octant, c)][o];
-                        float* to = sums + width * (8 * node + o);
-                        if (w == 0) continue;
-                        for (int64_t k = 0; k < width; ++k) to[k] += w * row[std::size_t(k)];
-                    }
+    std::vector<float> row(std::size_t(width), 0.0f);
+    for (int64_t node = 0; node < n; ++node) {
+        const int32_t* child = corners + 8 * int64_t(first[node]);
+        for (int octant = 0; octant < 8; ++octant) {
+            if (!(mask[node] >> octant & 1)) continue;
+            for (int c = 0; c < 8; ++c) {
+                const int64_t v = child[c];
+                for (int64_t k = 0; k < width; ++k) row[std::size_t(k)] = weight[v] * rows[width * v + k];
+                row[std::size_t(density)] = weight[v];
+                for (int o = 0; o < 8; ++o) {
+                    const float w = 0.125f * weights[lattice_place(octant, c)][o];
+                    float* to = sums + width * (8 * node + o);
+                    if (w == 0) continue;
+                    for (int64_t k = 0; k < width; ++k) to[k] += w * row[std::size_t(k)];
                 }
-                child += 8;
             }
+            child += 8;
         }
-    });
+    }
 }
 
 template void restrict_cells(const uint8_t*, const int32_t*, int64_t, const int32_t*, const float*, int64_t, const float*, int64_t, float*);
