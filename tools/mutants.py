@@ -262,7 +262,7 @@ MUTANTS = (
     M("nerfvol/starts/exposures.py", "1.4826 * float(np.median(np.abs(left.mean(1))))", "float(left.std())", EXPOSURES, "one pair in a shadow makes all doubtful"),
     M("nerfvol/starts/exposures.py", "< COVERED * n", "< 0", EXPOSURES, "what shares nothing is compared"),
     M("nerfvol/training/train.py", "left >= MEASURED_FROM * len(dataset)", "left >= 0", "training/test_appearance.py", "seconds that a run does not have measure exposures"),
-    M("nerfvol/config/training.py", "< budget <= SPLATS_UNTIL", "< budget < SPLATS_UNTIL", "training/test_octree_start.py", "the budget at which octrees begin as splats no more"),
+    M("nerfvol/config/training.py", "< budget <= until", "< budget < until", "training/test_octree_start.py", "the budget at which octrees begin as splats no more"),
     M("nerfvol/config/training.py", " and not is_simulated else", " else", "training/test_octree_start.py", "media begin as surfaces"),
     M("nerfvol/config/training.py", "        if begun:\n", "        if False:\n", "training/test_octree_start.py", "another budget changes a resumed run's start"),
     M("nerfvol/training/train.py", '"splats" and run.phase in ("start", "splats") else', '"splats" else', "training/test_resume.py", "an octree's start is trained again on resuming"),

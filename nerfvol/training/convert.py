@@ -39,6 +39,7 @@ from nerfvol.starts.subject import subject_of
 from nerfvol.starts.surfaces import Seen, write_surfaces
 from nerfvol.starts.surfels import surfels
 from nerfvol.starts.visible import judged_downscale, largest_weights, thickness
+from nerfvol.training.finishing import LARGEST_RESERVE, seconds_of_picture, seconds_to_score
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
@@ -62,8 +63,8 @@ VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
 MOST_LEVEL = 10
 FINE_STEPS = 1500
 """Steps on photographs where no time is given."""
-LOOK_AGAIN, RESERVE_SHARE = 0.08, 0.3
-"""Shares of a time budget: after the first, what comes after the training is measured anew; it is given the second at most."""
+LOOK_AGAIN = 0.08
+"""Share of a time budget after which what comes after the training is measured anew."""
 
 FIT = {
     "downscales": [1], "stage_ends": [1.0], "tiles": [320], "prunes": [1], "prune_steps": 20, "foreground_share": 0.97,
@@ -248,14 +249,16 @@ def tuned_splats(
 
 
 def _run(phase: FinalPhase, camera: Camera, budget: float | None, scored: int, say: Say) -> None:
-    """A phase's steps, one at least: FINE_STEPS, or until the budget; what comes after them is measured on ``camera``."""
+    """A phase's steps, one at least: FINE_STEPS, or until the budget; what comes after them is measured on ``camera``: writing,
+    drawing ``scored`` views, and their scores, which the model that there was before has too."""
     begun, done, progress, looked, after = process_seconds(), 0, 0.0, -math.inf, 0.0
+    lens = camera.intrinsics
+    scores = 0.0 if budget is None else 2 * seconds_to_score(np.zeros((lens.height, lens.width, 3), np.float32))
     while progress < 1:
         if budget is not None and process_seconds() - looked >= LOOK_AGAIN * budget:
             looked = process_seconds()
-            phase.picture(camera)
-            after = phase.seconds_to_write() + 1.1 * scored * (process_seconds() - looked)
-            after = min(after, RESERVE_SHARE * budget)
+            after = phase.seconds_to_write() + 1.1 * scored * (seconds_of_picture(phase, camera) + scores)
+            after = min(after, LARGEST_RESERVE * budget)
         phase.step(progress)
         done += 1
         left = None if budget is None else budget - after - begun

@@ -123,7 +123,7 @@ def test_a_slow_clock_reaches_the_finest_stage(tmp_path, tiny_scene, monkeypatch
     steps = []
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: seconds_a_step * (steps[-1] if steps else 0))
     monkeypatch.setattr(finishing, "EXPECTED_SECONDS_TO_WRITE", 100.0)
-    monkeypatch.setattr(OctreeTrainer, "seconds_to_write", lambda self: 100.0)
+    monkeypatch.setattr(OctreeTrainer, "seconds_to_write", lambda self: 2.0)
     monkeypatch.setattr(session.Run, "claim", claim_and_count(session.Run.claim, steps))
     config = settings(tiny_scene, tmp_path, time_budget=10.0, init="direct", checkpoint_every=1000)
     config.octree = dataclasses.replace(OctreeConfig(), **MANY, most_epochs=10**9)
