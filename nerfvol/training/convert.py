@@ -44,6 +44,7 @@ from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
+from nerfvol.training.surface_stages import image_factor, rays_of, with_stage
 from nerfvol.views import SplatModel
 
 MOST_DISCS = 100_000
@@ -163,6 +164,22 @@ def surfaces_of(
     return _with_surfaces(
         octree, looked_at(SplatModel(splats), evenly(small_cameras(cameras, scene), LOOKS), background)[0]
     )
+
+
+def surfaces_to_train(
+    splats: Splats, dataset: Dataset, background: Sequence[float], config: Config, level: int | None = None
+) -> tuple[Octree, Config]:
+    """The octree of splats that will be trained on photographs, and ``config`` with its stage: both as fine as its time has
+    rays for (training/surface_stages.py), where no ``level`` is asked for and the scene is not an object."""
+    scene, cameras = dataset.scene, dataset.cameras
+    if level is None and scene.is_unbounded:
+        left = None if config.time_budget is None else max(config.time_budget - process_seconds(), 1.0)
+        settings = dataclasses.replace(config.octree, steps=FINE_STEPS)
+        factor = image_factor(cameras, rays_of(settings, left))
+        cameras = [camera.scaled(factor) for camera in cameras]
+        level = finest_level(scene, cameras) + 1
+        config = dataclasses.replace(config, octree=with_stage(config.octree, level, factor))
+    return surfaces_of(splats, scene, cameras, background, level), config
 
 
 def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:

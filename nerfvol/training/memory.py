@@ -58,9 +58,10 @@ BYTES_PER_LIT_PIXEL = 28
 """Per training pixel of a medium: a ray (six float32) and four bytes."""
 BYTES_PER_LIT_SAMPLE = 80
 """Per step along a ray of a medium, looked up or not: position, thickness, transmittance, and what torch keeps of them."""
-SURFACE_LEAVES_PER_SPLAT, SURFACE_LEAVES_PER_PIXEL = 32, 6.5
-"""Leaves of the octree that splats of photographs become, for each splat, and for each pixel of one view, whichever is less:
-leaves are no finer than pixels, and fill what all views show. Bonsai has 29 and 4.0, fern 29 and 5.6."""
+SURFACE_LEAVES_PER_SPLAT, SURFACE_LEAVES_PER_PIXEL, PHOTOGRAPH_SURFACE_LEAVES_PER_PIXEL = 32, 2.5, 6.5
+"""Leaves of the octree that splats become, for each splat, and for each pixel of one view of an object or a photograph,
+whichever is less: leaves are no finer than pixels, and fill what all views show. Lego has 6 and 2.3, at 800x800 19 and 1.6;
+bonsai 29 and 4.0, fern 29 and 5.6."""
 SURFACE_BYTES = 1300
 """A leaf of that octree, while it is made: cells of each Gaussian, sums of what they hold, values of corners. Fern takes 1,040
 to 1,070, a wall of discs that overlap much 1,290."""
@@ -271,10 +272,10 @@ def starting_splats_bytes(
     return held + held_out_bytes + max(splat_bytes(schedule, config), LOOK_BYTES * looked_at + SURFACE_BYTES * leaves)
 
 
-def surface_leaves(splats: int, view_pixels: int) -> int:
-    """Leaves of the octree that so many ``splats`` of photographs become, at most about; of leaves as wide as the pixels of a
-    view of so many."""
-    return int(min(SURFACE_LEAVES_PER_SPLAT * splats, SURFACE_LEAVES_PER_PIXEL * view_pixels))
+def surface_leaves(splats: int, view_pixels: int, photographs: bool = True) -> int:
+    """Leaves, at most about, of the octree that so many ``splats`` become; ``view_pixels``: of a view whose pixels they suit."""
+    per_pixel = PHOTOGRAPH_SURFACE_LEAVES_PER_PIXEL if photographs else SURFACE_LEAVES_PER_PIXEL
+    return int(min(SURFACE_LEAVES_PER_SPLAT * splats, per_pixel * view_pixels))
 
 
 def splat_memory(

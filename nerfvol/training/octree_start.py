@@ -92,8 +92,7 @@ def start_from_field(run: Run, optimise: Optimise) -> Octree:
 @dataclass(frozen=True, eq=False)
 class SplatPlan:
     """What splats that an octree is made of will be trained on and how; bytes: of memory next to the program meanwhile; leaves:
-    of their octree, at most about, 0: no more than others have; factor: of the images' reduction that it is trained on, None:
-    its settings say that."""
+    of their octree, at most about; factor: of the images' reduction that it is trained on, None: its settings say that."""
 
     photographs: Photographs
     schedule: Schedule
@@ -131,23 +130,22 @@ def prepare_splats(run: Run) -> SplatPlan:
     splat_memory(dataset, photographs, schedule, settings, kept)
     lenses = [camera.intrinsics for camera in evenly(small_cameras(dataset.cameras, dataset.scene), LOOKS)]
     looked_at = sum(lens.width * lens.height for lens in lenses)
-    factor, leaves = None, 0
-    if dataset.scene.is_unbounded:
-        factor, leaves = _how_fine(run, schedule.most)
+    factor, leaves = _how_fine(run, schedule.most)
     used = starting_splats_bytes(dataset, photographs, schedule, settings, kept, looked_at, leaves)
     return SplatPlan(photographs, schedule, used, leaves, factor)
 
 
 def _how_fine(run: Run, splats: int) -> tuple[int | None, int]:
-    """By how much the images are reduced that an octree of at most so many ``splats`` of photographs is trained on, None: as
-    its settings say, and about how many leaves it begins with: as there are rays and memory for."""
+    """By how much the photographs are reduced that an octree of at most so many ``splats`` is trained on, None: as its settings
+    say, and about how many leaves it begins with: as there are rays and memory for."""
     from nerfvol.training.splat_start import start_share
 
     dataset, left = run.data.training, run.seconds_left()
     lens = dataset.cameras[0].intrinsics
     pixels = lens.width * lens.height
-    if has_stages_of_its_own(run.given.octree):
-        return None, surface_leaves(splats, pixels)
+    photographs = dataset.scene.is_unbounded
+    if not photographs or has_stages_of_its_own(run.given.octree):
+        return None, surface_leaves(splats, pixels, photographs)
     seconds = None if left is None else (1 - start_share(dataset.scene)) * left
     factor, most = image_factor(dataset.cameras, rays_of(run.config.octree, seconds)), photographs_bytes()
     while (
