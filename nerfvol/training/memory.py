@@ -273,7 +273,7 @@ def starting_splats_bytes(
 
 
 def surface_leaves(splats: int, view_pixels: int, photographs: bool = True) -> int:
-    """Leaves, at most about, of the octree that so many ``splats`` become; ``view_pixels``: of a view whose pixels they suit."""
+    """Leaves, at most about, of the octree that so many ``splats`` become; ``view_pixels``: of a view that they suit."""
     per_pixel = PHOTOGRAPH_SURFACE_LEAVES_PER_PIXEL if photographs else SURFACE_LEAVES_PER_PIXEL
     return int(min(SURFACE_LEAVES_PER_SPLAT * splats, per_pixel * view_pixels))
 
