@@ -265,7 +265,7 @@ MUTANTS = (
     M("nerfvol/config/training.py", "< budget <= until", "< budget < until", "training/test_octree_start.py", "the budget at which octrees begin as splats no more"),
     M("nerfvol/config/training.py", " and not is_simulated else", " else", "training/test_octree_start.py", "media begin as surfaces"),
     M("nerfvol/training/convert.py", "finest_level(scene, cameras) + scene.is_unbounded, most", "finest_level(scene, cameras), most", "training/test_photographs_from_splats.py", "photographs' surfaces a level too coarse"),
-    M("nerfvol/training/memory.py", "wanted = max(wanted, leaves)", "pass", "training/test_photographs_from_splats.py", "leaves that splats become are not announced"),
+    M("nerfvol/training/memory.py", "wanted = leaves if leaves and dataset.scene.is_unbounded else max(wanted, leaves)", "pass", "training/test_photographs_from_splats.py", "leaves that splats become are not announced"),
     M("nerfvol/training/octree_start.py", "        asked.go_on_from(appearance)", "        pass", "training/test_photographs_from_splats.py", "colour maps of splats are lost"),
     M("nerfvol/training/octree_start.py", "        run.without_splats()\n        run.say(f\"start: low density, for there", "        run.say(f\"start: low density, for there", "training/test_photographs_from_splats.py", "low density with the settings of surfaces"),
     M("nerfvol/training/finishing.py", "sure = writing + data.reading + table", "sure = table", "training/test_budget.py", "writing and reading are not kept of a budget"),

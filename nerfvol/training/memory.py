@@ -347,7 +347,7 @@ class OctreePlan:
         self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp", splats=splats)
         self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)
-        wanted = max(wanted, leaves)
+        wanted = leaves if leaves and dataset.scene.is_unbounded else max(wanted, leaves)
         self.max_leaves = affordable_leaves(dataset, self._degree, least=min(wanted, 1 << 18), other=self._other)
         self._announced = min(wanted, self.max_leaves)
 

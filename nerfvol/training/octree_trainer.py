@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -85,7 +86,7 @@ class OctreeTrainer(GrowingOctree):
         self.steps_done, self._progress = 0, 0.0
         self.stage_steps = np.zeros(len(config.levels), np.int64)
         self.cursors = Cursors()
-        self.prunings = 0
+        self.prunings, self.seconds_a_leaf = 0, 0.0  # that the last pruning took; no clock for anything but finishing
         self.bank: TileBank | None = None
         self.plan = plan
         self.steps = config.steps
@@ -115,8 +116,9 @@ class OctreeTrainer(GrowingOctree):
         return f"{self.octree.n_leaves:,} leaves"
 
     def seconds_to_write(self) -> float:
-        """See Phase."""
-        return seconds_to_write(self.octree)
+        """See Phase: as long as prunings of the run took a leaf, and what the octree takes that they leave."""
+        pruning = len(FINAL_PRUNE_WEIGHTS) * self.seconds_a_leaf * self.octree.n_leaves
+        return pruning + seconds_to_write(self.octree)
 
     def needs_images(self) -> bool:
         """Until the tiles at hand serve to the end."""
@@ -327,8 +329,10 @@ class OctreeTrainer(GrowingOctree):
                 "that --background is the images' background and that the scene bounds contain the object, or lower "
                 "octree.colour_weight and octree.distortion"
             )
+        started, leaves = time.perf_counter(), self.octree.n_leaves
         error, footprint = self.state.error[keep], self.state.footprint[keep]
         self.change(*self.octree.prune(keep))
+        self.seconds_a_leaf = (time.perf_counter() - started) / leaves
         return error, footprint
 
     def finish(self) -> Octree:

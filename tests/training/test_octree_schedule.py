@@ -10,7 +10,7 @@ import pytest
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
-from nerfvol.training import finishing, session
+from nerfvol.training import finishing, octree_trainer, session
 from nerfvol.training.octree_schedule import (
     ENOUGH_TILES,
     ENOUGH_TILES_OF_PHOTOGRAPHS,
@@ -162,3 +162,18 @@ def test_a_shortened_run_is_resumed_exactly(tiny_scene):
         stages.append((whole.stage, parts.stage))
     assert all(a == b for a, b in stages) and stages[-1][0] == 4 and len({a for a, _ in stages}) == 3
     assert np.array_equal(whole.octree.values, parts.octree.values)
+
+
+def test_prunings_of_the_run_tell_what_the_last_one_takes(tiny_scene, monkeypatch):
+    """By a clock that goes on a second between two looks, of a pruning that leaves half: three for as many leaves each."""
+    config = OctreeConfig(levels=[4], downscales=[1], stage_ends=[1.0], tiles=[16], prunes=[0])
+    trainer = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config)
+    monkeypatch.setattr(octree_trainer, "seconds_to_write", lambda octree: 1.0)
+    assert trainer.seconds_to_write() == 1.0  # nothing is known yet
+    looks = itertools.count()
+    monkeypatch.setattr(octree_trainer.time, "perf_counter", lambda: float(next(looks)))
+    trainer.state.max_weight[::2] = 1.0
+    before = trainer.octree.n_leaves
+    trainer.prune()
+    assert trainer.octree.n_leaves == before / 2
+    assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5)
