@@ -44,7 +44,7 @@ from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
-from nerfvol.training.surface_stages import image_factor, rays_of, with_stage
+from nerfvol.training.surface_stages import image_factor, levels_finer, rays_of, with_stage
 from nerfvol.views import SplatModel
 
 MOST_DISCS = 100_000
@@ -175,9 +175,10 @@ def surfaces_to_train(
     if level is None and scene.is_unbounded:
         left = None if config.time_budget is None else max(config.time_budget - process_seconds(), 1.0)
         settings = dataclasses.replace(config.octree, steps=FINE_STEPS)
-        factor = image_factor(cameras, rays_of(settings, left))
+        rays = rays_of(settings, left)
+        factor = image_factor(cameras, rays)
         cameras = [camera.scaled(factor) for camera in cameras]
-        level = finest_level(scene, cameras) + 1
+        level = finest_level(scene, cameras) + levels_finer(cameras, rays)
         config = dataclasses.replace(config, octree=with_stage(config.octree, level, factor))
     return surfaces_of(splats, scene, cameras, background, level), config
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ from nerfvol.training.surface_stages import (
     MOST_FACTOR,
     has_stages_of_its_own,
     image_factor,
+    levels_finer,
     rays_of,
     stage_in,
     with_stage,
@@ -92,13 +94,13 @@ def start_from_field(run: Run, optimise: Optimise) -> Octree:
 @dataclass(frozen=True, eq=False)
 class SplatPlan:
     """What splats that an octree is made of will be trained on and how; bytes: of memory next to the program meanwhile; leaves:
-    of their octree, at most about; factor: of the images' reduction that it is trained on, None: its settings say that."""
+    of their octree, at most about; stage: its level and the factor of the photographs' reduction, None: as its settings say."""
 
     photographs: Photographs
     schedule: Schedule
     bytes: int
     leaves: int
-    factor: int | None
+    stage: tuple[int, int] | None
 
 
 def planned_splats(run: Run) -> SplatPlan | None:
@@ -130,29 +132,29 @@ def prepare_splats(run: Run) -> SplatPlan:
     splat_memory(dataset, photographs, schedule, settings, kept)
     lenses = [camera.intrinsics for camera in evenly(small_cameras(dataset.cameras, dataset.scene), LOOKS)]
     looked_at = sum(lens.width * lens.height for lens in lenses)
-    factor, leaves = _how_fine(run, schedule.most)
+    stage, leaves = _how_fine(run, schedule.most)
     used = starting_splats_bytes(dataset, photographs, schedule, settings, kept, looked_at, leaves)
-    return SplatPlan(photographs, schedule, used, leaves, factor)
+    return SplatPlan(photographs, schedule, used, leaves, stage)
 
 
-def _how_fine(run: Run, splats: int) -> tuple[int | None, int]:
-    """By how much the photographs are reduced that an octree of at most so many ``splats`` is trained on, None: as its settings
-    say, and about how many leaves it begins with: as there are rays and memory for."""
+def _how_fine(run: Run, splats: int) -> tuple[tuple[int, int] | None, int]:
+    """The stage of an octree that at most so many ``splats`` of photographs become, level of its finest leaves and factor of
+    the photographs' reduction, None: as its settings say; and about how many leaves it begins with. As fine as there are rays
+    and memory for."""
+    from nerfvol.training.convert import finest_level
     from nerfvol.training.splat_start import start_share
 
-    dataset, left = run.data.training, run.seconds_left()
-    lens = dataset.cameras[0].intrinsics
-    pixels = lens.width * lens.height
-    photographs = dataset.scene.is_unbounded
-    if not photographs or has_stages_of_its_own(run.given.octree):
-        return None, surface_leaves(splats, pixels, photographs)
-    seconds = None if left is None else (1 - start_share(dataset.scene)) * left
-    factor, most = image_factor(dataset.cameras, rays_of(run.config.octree, seconds)), photographs_bytes()
-    while (
-        most is not None and SURFACE_BYTES * surface_leaves(splats, pixels // factor**2) > most and factor < MOST_FACTOR
-    ):
+    scene, cameras, left = run.data.training.scene, run.data.training.cameras, run.seconds_left()
+    pixels = cameras[0].intrinsics.width * cameras[0].intrinsics.height
+    if not scene.is_unbounded or has_stages_of_its_own(run.given.octree):
+        return None, surface_leaves(splats, pixels, scene.is_unbounded)
+    rays = rays_of(run.config.octree, None if left is None else (1 - start_share(scene)) * left)
+    factor, most = image_factor(cameras, rays), photographs_bytes() or math.inf
+    while SURFACE_BYTES * surface_leaves(splats, pixels // factor**2) > most and factor < MOST_FACTOR:
         factor *= 2
-    return factor, surface_leaves(splats, pixels // factor**2)
+    cameras = [camera.scaled(factor) for camera in cameras]
+    level = finest_level(scene, cameras) + levels_finer(cameras, rays)
+    return (level, factor), surface_leaves(splats, pixels // factor**2)
 
 
 def start_from_splats(
@@ -186,11 +188,15 @@ def start_from_splats(
         asked.fit(partial(small_picture, data.training, picture=trainer.picture), MOMENTS[0])
     model = trainer.take_model({})
     del trainer
-    started, factor = time.perf_counter(), plan.factor or 1
-    cameras = [camera.scaled(factor) for camera in data.training.cameras] if factor > 1 else data.training.cameras
-    level = finest_level(scene, cameras) + scene.is_unbounded
-    if plan.factor is None:
-        level = min(level, MOST_LEVEL, max(config.octree.levels))
+    started, cameras = time.perf_counter(), data.training.cameras
+    if plan.stage is not None:
+        level, factor = plan.stage
+        cameras = [camera.scaled(factor) for camera in cameras]
+    else:
+        level, factor = (
+            min(finest_level(scene, cameras) + scene.is_unbounded, MOST_LEVEL, max(config.octree.levels)),
+            None,
+        )
     try:
         octree = surfaces_of(model.splats, scene, cameras, background, level)
     except InputError as error:
@@ -207,8 +213,8 @@ def start_from_splats(
         run.results[name] = {"seconds": spent, "leaves": leaves, "MB": made.describe()["bytes_in_memory"] / 1e6,
                              **summary(evaluate(made, data.compared, background))}  # fmt: skip
     run.results["splats"]["steps"] = steps
-    if plan.factor is not None:
-        run.results["converted"] |= {"level": level, "images": plan.factor}
+    if factor is not None:
+        run.results["converted"] |= {"level": level, "images": factor}
     return_free_memory()
     return octree
 

@@ -165,7 +165,8 @@ def test_a_shortened_run_is_resumed_exactly(tiny_scene):
 
 
 def test_prunings_of_the_run_tell_what_the_last_one_takes(tiny_scene, monkeypatch):
-    """By a clock that goes on a second between two looks, of a pruning that leaves half: three for as many leaves each."""
+    """By a clock that goes on a second between two looks, of a pruning that leaves half: three for as many leaves each. And of
+    a step of 16 tiles: what is left is drawn four times to be judged, at half of a step's time."""
     config = OctreeConfig(levels=[4], downscales=[1], stage_ends=[1.0], tiles=[16], prunes=[0])
     trainer = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config)
     monkeypatch.setattr(octree_trainer, "seconds_to_write", lambda octree: 1.0)
@@ -177,3 +178,6 @@ def test_prunings_of_the_run_tell_what_the_last_one_takes(tiny_scene, monkeypatc
     trainer.prune()
     assert trainer.octree.n_leaves == before / 2
     assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5)
+    trainer.step(0.5)
+    judging = 4 * octree_trainer.FINAL_TILES * 0.5 / 16
+    assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5 + judging)
