@@ -128,7 +128,7 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
     if isinstance(model, SplatModel | PointModel) and training is not None and trained:
         # What pictures of the splats stand for is at hand.
-        octree = convert.surfaces_of(model.splats, scene, training.cameras, background, options.level)
+        octree, config = convert.surfaces_to_train(model.splats, training, background, config, options.level)
         return OctreeModel(convert.tuned_octree(octree, training, background, config, scored), metadata)
     if isinstance(model, SplatModel | PointModel):
         octree = convert.octree_of(model.splats, scene, cameras, background, options.level, options.seed)

@@ -30,9 +30,11 @@ MOST_THREADS = 1024
 SHORT_RUN = 10.0
 """Seconds of a time budget up to which an octree begins with low density: distilling a field would take most of them, and
 splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2 dB)."""
-SPLATS_UNTIL = 45.0
-"""... and from there up to which that of an object that many views show begins as splats: fog takes most of them to become
-surfaces. Later that costs nothing any more, and what splats left out would be missing (docs/performance.md)."""
+SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
+"""... and from there up to which that of an object that many views show begins as splats, or up to so many seconds for each
+pixel of the pictures' shorter side, whichever is later: fog takes most of them to become surfaces (lego 400x400, 1 minute:
+33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3). Later that costs nothing any
+more, and what splats left out would be missing (docs/performance.md)."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
@@ -148,24 +150,30 @@ class Config(Checked):
             return "splats" if scene.is_unbounded else "octree"
         return "octree" if self.init in OCTREE_STARTS else "splats"
 
-    def for_views(self, n: int, scene: SceneBounds, is_simulated: bool = False, begun: Collection[str] = ()) -> Config:
+    def for_views(
+        self, n: int, scene: SceneBounds, is_simulated: bool = False, begun: Collection[str] = (), side: int = 0
+    ) -> Config:
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
         few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
-        smoothness in any case. Of one that many views show splats are there sooner than fog has become surfaces.
+        smoothness in any case. Of one that many views show, and in photographs, splats are there sooner than fog has become
+        surfaces; photographs keep haze that fog leaves for good.
 
         is_simulated: the data may show a medium, whose density counts: no splats, which are surfaces. begun: the phases that a
-        resumed run has begun: another time budget, which it may have, must not choose another start.
+        resumed run has begun: another time budget, which it may have, must not choose another start. side: of the pictures,
+        the shorter one, pixels.
         """
-        if self._suited(scene) != "octree" or scene.is_unbounded:
+        if self._suited(scene) != "octree":
             return self
-        few, budget = n <= self.field.few_views, self.time_budget
+        few, budget = n <= self.field.few_views and not scene.is_unbounded, self.time_budget
         if begun:
             start = "mlp" if "field" in begun else "splats" if "splats" in begun else "auto"
         elif few:
             start = "auto" if budget is not None and budget <= SHORT_RUN else "mlp"
         else:
-            is_short = budget is not None and SHORT_RUN < budget <= SPLATS_UNTIL
-            start = "splats" if is_short and not is_simulated else "auto"
+            until = max(SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL * side)
+            is_short = budget is not None and SHORT_RUN < budget <= until
+            suits = budget is not None if scene.is_unbounded else is_short
+            start = "splats" if suits and not is_simulated else "auto"
         init = start if self.init == "auto" else self.init
         return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS if few else {}))
 

@@ -78,6 +78,13 @@ class Appearance:
             maps[:, range(3), range(3)] = measured.gains
             self._use(centred(maps))
 
+    def go_on_from(self, other: Appearance) -> None:
+        """Takes the maps, and the decision for or against them, that ``other`` came to with another model of the photographs;
+        where they are used they will be fitted to the model at hand as well."""
+        self.decided = other.decided
+        if other.active:
+            self._use(other.maps.copy())
+
     def due(self, progress: float) -> bool:
         """Whether a fit is due at ``progress`` in [0, 1]; once it was decided that exposures are even, none is."""
         return self.may_change and progress >= MOMENTS[self.rounds]

@@ -39,10 +39,12 @@ from nerfvol.starts.subject import subject_of
 from nerfvol.starts.surfaces import Seen, write_surfaces
 from nerfvol.starts.surfels import surfels
 from nerfvol.starts.visible import judged_downscale, largest_weights, thickness
+from nerfvol.training.finishing import LARGEST_RESERVE, seconds_of_picture, seconds_to_score
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
+from nerfvol.training.surface_stages import image_factor, levels_finer, rays_of, with_stage
 from nerfvol.views import SplatModel
 
 MOST_DISCS = 100_000
@@ -62,8 +64,8 @@ VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
 MOST_LEVEL = 10
 FINE_STEPS = 1500
 """Steps on photographs where no time is given."""
-LOOK_AGAIN, RESERVE_SHARE = 0.08, 0.3
-"""Shares of a time budget: after the first, what comes after the training is measured anew; it is given the second at most."""
+LOOK_AGAIN = 0.08
+"""Share of a time budget after which what comes after the training is measured anew."""
 
 FIT = {
     "downscales": [1], "stage_ends": [1.0], "tiles": [320], "prunes": [1], "prune_steps": 20, "foreground_share": 0.97,
@@ -164,6 +166,23 @@ def surfaces_of(
     )
 
 
+def surfaces_to_train(
+    splats: Splats, dataset: Dataset, background: Sequence[float], config: Config, level: int | None = None
+) -> tuple[Octree, Config]:
+    """The octree of splats that will be trained on photographs, and ``config`` with its stage: both as fine as its time has
+    rays for (training/surface_stages.py), where no ``level`` is asked for and the scene is not an object."""
+    scene, cameras = dataset.scene, dataset.cameras
+    if level is None and scene.is_unbounded:
+        left = None if config.time_budget is None else max(config.time_budget - process_seconds(), 1.0)
+        settings = dataclasses.replace(config.octree, steps=FINE_STEPS)
+        rays = rays_of(settings, left)
+        factor = image_factor(cameras, rays)
+        cameras = [camera.scaled(factor) for camera in cameras]
+        level = finest_level(scene, cameras) + levels_finer(cameras, rays)
+        config = dataclasses.replace(config, octree=with_stage(config.octree, level, factor))
+    return surfaces_of(splats, scene, cameras, background, level), config
+
+
 def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:
     """Of splats as they stand, what LOOKS of ``views`` tell; without the leaves that are empty then."""
     write_surfaces(octree, evenly(views, LOOKS))
@@ -248,14 +267,16 @@ def tuned_splats(
 
 
 def _run(phase: FinalPhase, camera: Camera, budget: float | None, scored: int, say: Say) -> None:
-    """A phase's steps, one at least: FINE_STEPS, or until the budget; what comes after them is measured on ``camera``."""
+    """A phase's steps, one at least: FINE_STEPS, or until the budget; what comes after them is measured on ``camera``: writing,
+    drawing ``scored`` views, and their scores, which the model that there was before has too."""
     begun, done, progress, looked, after = process_seconds(), 0, 0.0, -math.inf, 0.0
+    lens = camera.intrinsics
+    scores = 0.0 if budget is None else 2 * seconds_to_score(np.zeros((lens.height, lens.width, 3), np.float32))
     while progress < 1:
         if budget is not None and process_seconds() - looked >= LOOK_AGAIN * budget:
             looked = process_seconds()
-            phase.picture(camera)
-            after = phase.seconds_to_write() + 1.1 * scored * (process_seconds() - looked)
-            after = min(after, RESERVE_SHARE * budget)
+            after = phase.seconds_to_write() + 1.1 * scored * (seconds_of_picture(phase, camera) + scores)
+            after = min(after, LARGEST_RESERVE * budget)
         phase.step(progress)
         done += 1
         left = None if budget is None else budget - after - begun

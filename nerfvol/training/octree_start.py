@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from nerfvol.config.octree import FINEST_LEVEL
+from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
@@ -25,24 +26,41 @@ from nerfvol.octree.tree import Octree
 from nerfvol.training.appearance import MOMENTS, Appearance, small_picture
 from nerfvol.training.field_phase import level_in_time
 from nerfvol.training.field_start import make_field_trainer
-from nerfvol.training.memory import photographs_bytes, splat_memory, starting_splats_bytes
+from nerfvol.training.memory import (
+    SURFACE_BYTES,
+    photographs_bytes,
+    splat_memory,
+    starting_splats_bytes,
+    surface_leaves,
+)
 from nerfvol.training.phase import Phase
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import Schedule
+from nerfvol.training.surface_stages import (
+    MOST_FACTOR,
+    has_stages_of_its_own,
+    image_factor,
+    levels_finer,
+    rays_of,
+    stage_in,
+    with_stage,
+)
 from nerfvol.views import OctreeModel
 
 Optimise = Callable[[Run, Phase], None]
 """Makes the steps of a phase (training.train.optimise)."""
 
 
-def why_start(config: Config, n_views: int) -> str | None:
+def why_start(config: Config, n_views: int, photographs: bool = False) -> str | None:
     """A sentence on the start that was chosen for ``n_views`` training views; None: low density, which needs none."""
     if config.init == "mlp":
         return (f"start: a field, then the octree that it is distilled to, for there are only {n_views} training "
                 "views; --init direct overrules")  # fmt: skip
     if config.init == "splats":
-        return (f"start: splats, then the octree of the surfaces that they show, for {config.time_budget or 0:g} s are short; "
-                "--init direct overrules")  # fmt: skip
+        why = (
+            "low density would leave haze in photographs" if photographs else f"{config.time_budget or 0:g} s are short"
+        )
+        return f"start: splats, then the octree of the surfaces that they show, for {why}; --init direct overrules"
     return None
 
 
@@ -77,11 +95,26 @@ def start_from_field(run: Run, optimise: Optimise) -> Octree:
 
 @dataclass(frozen=True, eq=False)
 class SplatPlan:
-    """What splats that an octree is made of will be trained on and how; bytes: of memory next to the program meanwhile."""
+    """What splats that an octree is made of will be trained on and how; bytes: of memory next to the program meanwhile; leaves:
+    of their octree, at most about; stage: its level and the factor of the photographs' reduction, None: as its settings say."""
 
     photographs: Photographs
     schedule: Schedule
     bytes: int
+    leaves: int
+    stage: tuple[int, int] | None
+
+
+def planned_splats(run: Run) -> SplatPlan | None:
+    """As :func:`prepare_splats`; None, with a sentence, where nobody asked for splats and there can be none."""
+    try:
+        return prepare_splats(run)
+    except InputError as error:
+        if run.given.init != "auto" or run.phase == "splats":
+            raise
+        run.without_splats()
+        run.say(f"start: low density, for there can be no splats first: {error}")
+        return None
 
 
 def prepare_splats(run: Run) -> SplatPlan:
@@ -101,8 +134,29 @@ def prepare_splats(run: Run) -> SplatPlan:
     splat_memory(dataset, photographs, schedule, settings, kept)
     lenses = [camera.intrinsics for camera in evenly(small_cameras(dataset.cameras, dataset.scene), LOOKS)]
     looked_at = sum(lens.width * lens.height for lens in lenses)
-    used = starting_splats_bytes(dataset, photographs, schedule, settings, kept, looked_at)
-    return SplatPlan(photographs, schedule, used)
+    stage, leaves = _how_fine(run, schedule.most)
+    used = starting_splats_bytes(dataset, photographs, schedule, settings, kept, looked_at, leaves)
+    return SplatPlan(photographs, schedule, used, leaves, stage)
+
+
+def _how_fine(run: Run, splats: int) -> tuple[tuple[int, int] | None, int]:
+    """The stage of an octree that at most so many ``splats`` of photographs become, level of its finest leaves and factor of
+    the photographs' reduction, None: as its settings say; and about how many leaves it begins with. As fine as there are rays
+    and memory for."""
+    from nerfvol.training.convert import finest_level
+    from nerfvol.training.splat_start import start_share
+
+    scene, cameras, left = run.data.training.scene, run.data.training.cameras, run.seconds_left()
+    pixels = cameras[0].intrinsics.width * cameras[0].intrinsics.height
+    if not scene.is_unbounded or has_stages_of_its_own(run.given.octree):
+        return None, surface_leaves(splats, pixels, scene.is_unbounded)
+    rays = rays_of(run.config.octree, None if left is None else (1 - start_share(scene)) * left)
+    factor, most = image_factor(cameras, rays), photographs_bytes() or math.inf
+    while SURFACE_BYTES * surface_leaves(splats, pixels // factor**2) > most and factor < MOST_FACTOR:
+        factor *= 2
+    cameras = [camera.scaled(factor) for camera in cameras]
+    level = finest_level(scene, cameras) + levels_finer(cameras, rays)
+    return (level, factor), surface_leaves(splats, pixels // factor**2)
 
 
 def start_from_splats(
@@ -112,33 +166,45 @@ def start_from_splats(
 
     None, with a sentence, where nobody asked for splats and they show no surfaces: low density is left to begin with.
 
-    appearance: of the splats' photographs. asked: of the octree's: splats tell whether exposures differ, in a sixth of the
-    time that the octree would take to draw all views.
+    appearance: of the splats' photographs. asked: of the octree's: they go on with the splats' colour maps where these have
+    some; else splats tell whether exposures differ, in a sixth of the time that the octree would take to draw all views.
 
     Raises:
         InputError: splats were asked for, and none lies in the scene's region, or none is seen.
     """
-    from nerfvol.training.convert import MOST_LEVEL, surfaces_of
-    from nerfvol.training.splat_start import StartingSplats, settings_of, start_splats
+    from nerfvol.training.convert import MOST_LEVEL, finest_level, surfaces_of
+    from nerfvol.training.splat_start import StartingSplats, settings_of, start_share, start_splats
 
     config, background, data = run.config, run.background, run.data
+    scene = data.training.scene
     splats, distance = start_splats(run, plan.photographs, plan.schedule.most)
     trainer = StartingSplats(
-        plan.photographs, splats, settings_of(config), plan.schedule, distance, background, config.seed, appearance
-    )
+        plan.photographs, splats, settings_of(config), plan.schedule, distance, background, config.seed, appearance,
+        share=start_share(scene),
+    )  # fmt: skip
     optimise(run, trainer)
     seconds, steps = run.phase_seconds(), trainer.steps_done
-    if not asked.active and asked.due(MOMENTS[0]):
+    if scene.is_unbounded and appearance.decided:
+        asked.go_on_from(appearance)
+    elif not asked.active and asked.due(MOMENTS[0]):
         asked.fit(partial(small_picture, data.training, picture=trainer.picture), MOMENTS[0])
     model = trainer.take_model({})
     del trainer
-    started, scene = time.perf_counter(), data.training.scene
-    finest = min(MOST_LEVEL, max(config.octree.levels))
+    started, cameras = time.perf_counter(), data.training.cameras
+    if plan.stage is not None:
+        level, factor = plan.stage
+        cameras = [camera.scaled(factor) for camera in cameras]
+    else:
+        level, factor = (
+            min(finest_level(scene, cameras) + scene.is_unbounded, MOST_LEVEL, max(config.octree.levels)),
+            None,
+        )
     try:
-        octree = surfaces_of(model.splats, scene, data.training.cameras, background, most_level=finest)
+        octree = surfaces_of(model.splats, scene, cameras, background, level)
     except InputError as error:
         if run.given.init != "auto":
             raise
+        run.without_splats()
         run.say(f"start: low density, for the splats became no octree: {error}")
         return None
     converted = OctreeModel(octree, run.metadata())
@@ -149,8 +215,20 @@ def start_from_splats(
         run.results[name] = {"seconds": spent, "leaves": leaves, "MB": made.describe()["bytes_in_memory"] / 1e6,
                              **summary(evaluate(made, data.compared, background))}  # fmt: skip
     run.results["splats"]["steps"] = steps
+    if factor is not None:
+        run.results["converted"] |= {"level": level, "images": factor}
     return_free_memory()
     return octree
+
+
+def settings_of_octree(run: Run) -> OctreeConfig:
+    """The octree's settings; where it began with surfaces of photographs, with the one stage that there is time for.
+
+    Raises:
+        InputError: a checkpoint that names no such stage.
+    """
+    stage = stage_in(run.results) if run.config.init == "splats" else None
+    return run.config.octree if stage is None else with_stage(run.config.octree, *stage)
 
 
 def summary(scores: dict[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -47,6 +48,8 @@ FEWEST_STEPS = 5000
 """Before a run with a time budget may end early, however few its tiles."""
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees are in memory while one is made."""
+DRAWN_SHARE = 0.5
+"""Of a step's time: drawing its tiles."""
 MOST_LEVELS_AT_ONCE = 2
 """Where stages are left out: more would split haze that was never pruned."""
 
@@ -86,6 +89,7 @@ class OctreeTrainer(GrowingOctree):
         self.stage_steps = np.zeros(len(config.levels), np.int64)
         self.cursors = Cursors()
         self.prunings = 0
+        self.seconds_a_leaf, self.seconds_a_tile = 0.0, 0.0  # of the last pruning and step: only seconds_to_write asks
         self.bank: TileBank | None = None
         self.plan = plan
         self.steps = config.steps
@@ -115,8 +119,11 @@ class OctreeTrainer(GrowingOctree):
         return f"{self.octree.n_leaves:,} leaves"
 
     def seconds_to_write(self) -> float:
-        """See Phase."""
-        return seconds_to_write(self.octree)
+        """See Phase: the last pruning, as long as the run's own took a leaf, its judgement, as long as steps take a tile, and
+        what the octree takes that it leaves."""
+        tries = len(FINAL_PRUNE_WEIGHTS)
+        judging = (tries + 1) * FINAL_TILES * DRAWN_SHARE * self.seconds_a_tile
+        return tries * self.seconds_a_leaf * self.octree.n_leaves + judging + seconds_to_write(self.octree)
 
     def needs_images(self) -> bool:
         """Until the tiles at hand serve to the end."""
@@ -202,7 +209,9 @@ class OctreeTrainer(GrowingOctree):
         options = losses_at(progress, c, self.chosen, self._random_background(), smooth)
         rates = rates_at(progress, c, self.chosen)
         batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
+        started = time.perf_counter()
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
+        self.seconds_a_tile = (time.perf_counter() - started) / c.tiles[self.stage]
         self.steps_done += 1
         self.stage_steps[self.stage] += 1
         self.tiles_seen += c.tiles[self.stage]
@@ -327,8 +336,10 @@ class OctreeTrainer(GrowingOctree):
                 "that --background is the images' background and that the scene bounds contain the object, or lower "
                 "octree.colour_weight and octree.distortion"
             )
+        started, leaves = time.perf_counter(), self.octree.n_leaves
         error, footprint = self.state.error[keep], self.state.footprint[keep]
         self.change(*self.octree.prune(keep))
+        self.seconds_a_leaf = (time.perf_counter() - started) / leaves
         return error, footprint
 
     def finish(self) -> Octree:

@@ -129,6 +129,7 @@ class Data:
     compared: parts of held-out views on which field, distilled and fine-tuned octree are compared. first: the first
     held-out view, for previews. reading: seconds that it takes to read the held-out images again; 0: they are kept.
     frame: what all of them are in; the finished model is brought back from it. fingerprint: of the training views.
+    loading: seconds that the training images took to be read, as they are again where a phase released them.
     """
 
     training: Dataset
@@ -138,6 +139,7 @@ class Data:
     reading: float
     frame: Frame = field(default_factory=Frame)
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
+    loading: float = 0.0
 
     @property
     def held_out_bytes(self) -> int:
@@ -151,10 +153,11 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
     Raises:
         InputError: the data cannot be used, or there is nothing in the images.
     """
+    started = time.perf_counter()
     training = load_dataset(
         config.data, "train", config.downscale, config.aabb, holdout=config.holdout, scene=config.scene
     )
-    started = time.perf_counter()
+    loading, started = time.perf_counter() - started, time.perf_counter()
     held_out = load_dataset(
         config.data,
         "val",
@@ -189,7 +192,7 @@ def load_data(config: Config, say: Callable[[str], object] = print) -> Data:
         )
     moved = [frame.dataset_into(d) for d in (training, held_out, compared, first)]
     lights = None if config.light is None else zlib.crc32(read_bytes(config.light))
-    return Data(moved[0], moved[1], moved[2], moved[3], reading, frame, fingerprint(training, lights))
+    return Data(moved[0], moved[1], moved[2], moved[3], reading, frame, fingerprint(training, lights), loading)
 
 
 def is_simulated(data: str) -> bool:

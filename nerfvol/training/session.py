@@ -9,7 +9,7 @@ import contextlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -56,22 +56,19 @@ class Run:
     def __init__(
         self, config: Config, data: Data, clock: Clock, saved: dict[str, Any] | None, say: Say = print
     ) -> None:
-        self.given = config
-        sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in data.training.cameras)
-        scene = data.training.scene
-        if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
-            begun = (saved or {}).get("steps", ())
-            config = config.for_views(len(data.training), scene, is_simulated(config.data), begun)
-        suited = config.for_scene(scene).for_pictures(sides[len(sides) // 2])
-        self.config = suited.before(data.training.backdrop)
-        self.background: tuple[float, float, float] = self.config.background or WHITE
-        self.data, self.clock, self.say = data, clock, say
-        self.folder = Path(config.out)
-        self.checkpoint = self.folder / run_folder.CHECKPOINT
+        self.given, self.data = config, data
         self.saved = saved or {"phase": "start", "log_bytes": 0, "results": {}, "steps": {}}
         self.phase: str = self.saved["phase"]
         self.results: dict[str, Any] = self.saved["results"]
         self.steps: dict[str, int] = self.saved["steps"]
+        begun = set(self.steps)
+        if self.phase == "octree" and "converted" not in self.results:
+            begun.discard("splats")  # they became no octree: it began with low density
+        self.config = self._settled(begun)
+        self.background: tuple[float, float, float] = self.config.background or WHITE
+        self.clock, self.say = clock, say
+        self.folder = Path(config.out)
+        self.checkpoint = self.folder / run_folder.CHECKPOINT
         self.phase_started, self.running = 0.0, math.nan
         self.interrupted = False
         self.watch: Watch | None = None
@@ -84,6 +81,20 @@ class Run:
         self._last_save = time.perf_counter()
         self._warned: set[str] = set()
         self._previewed, self._preview_cost = 0.0, PREVIEW_SECONDS  # seconds, of all and of the last
+
+    def _settled(self, begun: Collection[str]) -> Config:
+        """The settings as given, with those that the data decide; ``begun``: the phases that were begun before."""
+        config, scene, cameras = self.given, self.data.training.scene, self.data.training.cameras
+        sides = sorted(min(c.intrinsics.width, c.intrinsics.height) for c in cameras)
+        side = sides[len(sides) // 2]
+        if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
+            config = config.for_views(len(cameras), scene, is_simulated(config.data), begun, side)
+        suited = config.for_scene(scene).for_pictures(side)
+        return suited.before(self.data.training.backdrop)
+
+    def without_splats(self) -> None:
+        """What was to begin as splats, and nobody asked for it, begins with low density: there can be none."""
+        self.config = self._settled(("octree",))
 
     def enter(self, phase: Phase) -> None:
         """Begin the phase, or go on inside it where the checkpoint was written in it.

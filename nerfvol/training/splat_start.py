@@ -14,6 +14,7 @@ from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels.splat_state import SplatState
+from nerfvol.region import SceneBounds
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.choose import STARTS, choose_start
 from nerfvol.starts.cloud import splats_of_cloud
@@ -28,7 +29,7 @@ OPACITIES = {"random": 0.3, "hull": 0.8}
 """Random points are mostly nowhere: they begin fainter than points that were found (0.5); what silhouettes leave is opaque."""
 
 
-START_SHARE = 0.35
+START_SHARE, START_SHARE_OF_PHOTOGRAPHS = 0.35, 0.25
 """Of the time left in a run, what splats take that an octree is made of, ..."""
 START_STEPS = 700
 """... and their steps, at most, where there is no time budget."""
@@ -39,13 +40,23 @@ SECONDS_TO_CONVERT = 3.0
 class StartingSplats(SplatTrainer):
     """Splats that an octree is made of: they leave most of the time to it."""
 
+    def __init__(self, *arguments: Any, share: float) -> None:
+        """``arguments``: SplatTrainer's; ``share``: of the time left that is theirs."""
+        super().__init__(*arguments)
+        self.share = share
+
     def share_of(self, seconds: float) -> float:
-        """START_SHARE of the time left."""
-        return START_SHARE * seconds
+        """Their share of the time left."""
+        return self.share * seconds
 
     def seconds_to_write(self) -> float:
         """Their octree comes first."""
         return SECONDS_TO_CONVERT
+
+
+def start_share(scene: SceneBounds) -> float:
+    """The share of the time that splats have that an octree of ``scene`` is made of."""
+    return START_SHARE_OF_PHOTOGRAPHS if scene.is_unbounded else START_SHARE
 
 
 def settings_of(config: Config) -> SplatConfig:
@@ -62,7 +73,7 @@ def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
         with _saved_of(run) as saved:
             return saved_schedule(saved)
     left = run.seconds_left()
-    share = START_SHARE if config.representation == "octree" else 1.0
+    share = start_share(run.data.training.scene) if config.representation == "octree" else 1.0
     seconds = settings_of(config).steps * SECONDS_PER_STEP if left is None else share * left
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
     return make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)

@@ -34,13 +34,21 @@ from nerfvol.medium.lighting import load_lighting
 from nerfvol.models import Model, load_model
 from nerfvol.native import need_torch
 from nerfvol.starts.exposures import measure_exposures
+from nerfvol.starts.fog import low_density_octree
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.clock import Clock
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.few_views import few_views
 from nerfvol.training.field_start import make_final_trainer
 from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, photographs_bytes, splat_memory
-from nerfvol.training.octree_start import prepare_splats, start_from_field, start_from_splats, summary, why_start
+from nerfvol.training.octree_start import (
+    planned_splats,
+    settings_of_octree,
+    start_from_field,
+    start_from_splats,
+    summary,
+    why_start,
+)
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
@@ -156,19 +164,25 @@ def _train(
 # ------------------------------------------------------------------ what is trained
 def begin_octree(run: Run) -> OctreeTrainer:
     """The trainer of an octree: from low density, or from a field or splats that are trained first."""
-    config, data = run.config, run.data
-    splats = prepare_splats(run) if config.init == "splats" and run.phase in ("start", "splats") else None
-    plan = OctreePlan(config, data.training, data.held_out_bytes, splats.bytes if splats else 0)
+    data = run.data
+    splats = planned_splats(run) if run.config.init == "splats" and run.phase in ("start", "splats") else None
+    bytes_of_splats, leaves = (splats.bytes, splats.leaves) if splats is not None else (0, 0)
+    plan = OctreePlan(run.config, data.training, data.held_out_bytes, bytes_of_splats, leaves)
     announce(run, plan.sentence())
-    if config.init != run.given.init and (chosen := why_start(config, len(data.training))) is not None:
+    photographs = data.training.scene.is_unbounded
+    if run.config.init != run.given.init and (chosen := why_start(run.config, len(data.training), photographs)):
         run.say(chosen)
-    octree, appearance = None, appearance_of(run)
+    # A resumed run's is the checkpoint's: of low density it might begin with a level that fills the memory.
+    octree = low_density_octree(data.training, 3, 1) if run.phase == "octree" else None
+    # Photographs that splats see are measured for them, and the octree goes on with what they found.
+    appearance = appearance_of(run, measured=splats is None or not photographs)
     if splats is not None:
         octree = start_from_splats(run, splats, appearance_of(run, splats.photographs), appearance, optimise)
         splats = None  # its photographs' memory is the octree's now
-    elif config.init == "mlp" and run.phase in ("start", "field"):
+    elif run.config.init == "mlp" and run.phase in ("start", "field"):
         octree = start_from_field(run, optimise)
-    return OctreeTrainer(data.training, run.background, config.octree, config.seed, octree, plan, appearance)
+    settings = settings_of_octree(run)
+    return OctreeTrainer(data.training, run.background, settings, run.config.seed, octree, plan, appearance)
 
 
 def begin_field(run: Run) -> CompiledFieldTrainer:
@@ -211,14 +225,16 @@ def begin_splats(run: Run) -> SplatTrainer:
     )  # fmt: skip
 
 
-def appearance_of(run: Run, photographs: Photographs | None = None) -> Appearance:
+def appearance_of(run: Run, photographs: Photographs | None = None, measured: bool = True) -> Appearance:
     """The colour maps of the run's photographs, which say themselves whether they need any. Objects whose pictures have the
-    background painted in, as splats see all of them, have none: a map would change the background too."""
+    background painted in, as splats see all of them, have none: a map would change the background too. ``measured``: whether
+    photographs are asked now, before any model."""
     dataset, config = run.data.training, run.config
     keeps_alpha = config.representation == "octree" and photographs is None and dataset.images[0].shape[2] == 4
     mapped = dataset.scene.is_unbounded or keeps_alpha
     appearance = Appearance(len(dataset), config.appearance if mapped else "off")
-    if appearance.mode != "off" and run.phase != config.representation:  # else the checkpoint knows
+    begun = config.representation if photographs is None else "splats"
+    if measured and appearance.mode != "off" and run.phase != begun:  # else the checkpoint knows
         left = run.seconds_left()
         if appearance.mode == "on" or left is None or left >= MEASURED_FROM * len(dataset):
             appearance.begin(measure_exposures(dataset, photographs))

@@ -14,7 +14,7 @@ from nerfvol.rotations import turning_z_to
 from nerfvol.splats.points import dc_of_colour
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.gaussians import splats_of_leaves
-from nerfvol.training import convert
+from nerfvol.training import convert, finishing
 from nerfvol.training.convert import cameras_around, discs_of, octree_of, seen_by
 from nerfvol.views import OctreeModel, SplatModel
 from tests.fixtures.tiny import TINY_RADIUS, sphere_colour
@@ -116,6 +116,8 @@ def test_cameras_all_around_see_all_of_it():
 class Ticking:
     """A phase on a clock of its own: a step takes a second, a picture two, writing three."""
 
+    timed_at = 1
+
     def __init__(self, now: float) -> None:
         self.now, self.progress = now, []
 
@@ -142,6 +144,7 @@ def test_a_time_budget_is_that_of_the_whole_command(monkeypatch, begun, ends):
     most a step and a look at a picture later. Where nothing is left there is one step."""
     phase = Ticking(begun)
     monkeypatch.setattr(convert, "process_seconds", lambda: phase.now)
+    monkeypatch.setattr(finishing.time, "perf_counter", lambda: phase.now)
     convert._run(phase, cameras(1, 0)[0], 40.0, 2, lambda sentence: None)
     assert phase.progress[0] == 0
     if ends is None:

@@ -10,7 +10,7 @@ import pytest
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
-from nerfvol.training import finishing, session
+from nerfvol.training import finishing, octree_trainer, session
 from nerfvol.training.octree_schedule import (
     ENOUGH_TILES,
     ENOUGH_TILES_OF_PHOTOGRAPHS,
@@ -123,7 +123,7 @@ def test_a_slow_clock_reaches_the_finest_stage(tmp_path, tiny_scene, monkeypatch
     steps = []
     monkeypatch.setattr(session.Clock, "elapsed", lambda self: seconds_a_step * (steps[-1] if steps else 0))
     monkeypatch.setattr(finishing, "EXPECTED_SECONDS_TO_WRITE", 100.0)
-    monkeypatch.setattr(OctreeTrainer, "seconds_to_write", lambda self: 100.0)
+    monkeypatch.setattr(OctreeTrainer, "seconds_to_write", lambda self: 2.0)
     monkeypatch.setattr(session.Run, "claim", claim_and_count(session.Run.claim, steps))
     config = settings(tiny_scene, tmp_path, time_budget=10.0, init="direct", checkpoint_every=1000)
     config.octree = dataclasses.replace(OctreeConfig(), **MANY, most_epochs=10**9)
@@ -162,3 +162,22 @@ def test_a_shortened_run_is_resumed_exactly(tiny_scene):
         stages.append((whole.stage, parts.stage))
     assert all(a == b for a, b in stages) and stages[-1][0] == 4 and len({a for a, _ in stages}) == 3
     assert np.array_equal(whole.octree.values, parts.octree.values)
+
+
+def test_prunings_of_the_run_tell_what_the_last_one_takes(tiny_scene, monkeypatch):
+    """By a clock that goes on a second between two looks, of a pruning that leaves half: three for as many leaves each. And of
+    a step of 16 tiles: what is left is drawn four times to be judged, at half of a step's time."""
+    config = OctreeConfig(levels=[4], downscales=[1], stage_ends=[1.0], tiles=[16], prunes=[0])
+    trainer = OctreeTrainer(load_dataset(tiny_scene, "train"), (1, 1, 1), config)
+    monkeypatch.setattr(octree_trainer, "seconds_to_write", lambda octree: 1.0)
+    assert trainer.seconds_to_write() == 1.0  # nothing is known yet
+    looks = itertools.count()
+    monkeypatch.setattr(octree_trainer.time, "perf_counter", lambda: float(next(looks)))
+    trainer.state.max_weight[::2] = 1.0
+    before = trainer.octree.n_leaves
+    trainer.prune()
+    assert trainer.octree.n_leaves == before / 2
+    assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5)
+    trainer.step(0.5)
+    judging = 4 * octree_trainer.FINAL_TILES * 0.5 / 16
+    assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5 + judging)

@@ -26,6 +26,7 @@ from tests.fixtures.runs import metrics_of, run_of, settings, start
 
 pytestmark = pytest.mark.skipif(native() is None, reason="the reference path takes minutes")
 BOX = np.array([[-1.0] * 3, [1.0] * 3])
+PHOTOGRAPHS = SceneBounds(BOX, 16 * BOX, False)
 
 
 # ---------------------------------------------------------------- which start
@@ -46,7 +47,31 @@ def test_octrees_of_objects_begin_as_splats_where_time_is_short(views, given, ex
     assert config.for_views(views, scene).init == expected
     kept = "auto" if (expected, config.init) == ("splats", "auto") else expected
     assert config.for_views(views, scene, is_simulated=True).init == kept  # what may be a medium has no surfaces
-    assert config.for_views(views, SceneBounds(BOX, 16 * BOX, False)).init == config.init  # photographs
+
+
+def test_large_pictures_begin_as_splats_for_longer():
+    """Two minutes of 800x800; no shorter for small ones."""
+    scene = SceneBounds(BOX, None, True)
+    for side, until in ((40, SPLATS_UNTIL), (400, SPLATS_UNTIL), (800, 120.0)):
+        starts = [Config(time_budget=budget).for_views(100, scene, side=side).init for budget in (until, until + 1)]
+        assert starts == ["splats", "auto"]
+
+
+@pytest.mark.parametrize("given, expected", [
+    ({"time_budget": 5.0, "representation": "octree"}, "splats"),
+    ({"time_budget": 900.0, "representation": "octree"}, "splats"),
+    ({"representation": "octree"}, "auto"), ({"time_budget": 60.0}, "auto"),
+    ({"time_budget": 60.0, "representation": "octree", "init": "direct"}, "direct"),
+    ({"time_budget": 60.0, "representation": "field"}, "auto"),
+])  # fmt: skip
+@pytest.mark.parametrize("views", [3, 100])
+def test_octrees_of_photographs_begin_as_splats(given, expected, views):
+    """... however few and however long, where a budget says that seconds count; not where they may show a medium."""
+    config, scene = Config(**given), PHOTOGRAPHS
+    settled = config.for_views(views, scene)
+    assert settled.init == expected and settled.octree == config.octree
+    kept = "auto" if (expected, config.init) == ("splats", "auto") else expected
+    assert config.for_views(views, scene, is_simulated=True).init == kept
 
 
 @pytest.mark.parametrize("given, phases, expected", [
@@ -77,6 +102,9 @@ def test_another_budget_does_not_choose_another_start_half_way(tmp_path, tiny_sc
     assert Run(config, data, Clock(0.0, 0.0), {**saved, "steps": {"octree": 3}}).config.init == "auto"
     config.time_budget = 1000.0
     assert Run(config, data, Clock(0.0, 0.0), None).config.init == "auto"
+    for results, init in (({}, "auto"), ({"converted": {}}, "splats")):  # splats that became no octree left low density
+        both = {"phase": "octree", "log_bytes": 0, "results": results, "steps": {"splats": 3, "octree": 1}}
+        assert Run(config, data, Clock(0.0, 0.0), both).config.init == init
 
 
 @pytest.mark.parametrize("name", ["truth.npz", "provenance.json"])
@@ -94,6 +122,9 @@ def test_the_choice_is_one_sentence():
     assert "only 8 training views" in field and field.startswith("start: a field, ")
     assert splats == ("start: splats, then the octree of the surfaces that they show, for 30 s are short; "
                       "--init direct overrules")  # fmt: skip
+    photographs = octree_start.why_start(Config(init="splats", time_budget=90.0), 8, photographs=True)
+    assert photographs == ("start: splats, then the octree of the surfaces that they show, for low density would leave haze in "
+                           "photographs; --init direct overrules")  # fmt: skip
 
 
 @pytest.mark.parametrize("given, reason", [
