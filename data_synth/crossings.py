@@ -10,18 +10,28 @@ convex) by at most h^2/8 times the sum of its second derivatives along the axes,
 lies within h^2 / (4 (R - 2h)) of the true one; a component of the gradient is off by at most h / (2 (R - 2h)) to first order.
 
 Samples lie in the bricks of ``media.py``, but those alone that the surface crosses; the others say whether they are inside.
+
+Renderers call this code through its address, as they call densities that are functions (``functions.py``): it is compiled by
+itself, the first time that a scene has a level set, and is no part of what others compile.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple, cast
 
+import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.ccallback import CFunc
+from numba.extending import intrinsic, overload
 
 from data_synth.bricks import SIDE
 from data_synth.fields import cell_at, mixed
+from data_synth import jit as compiling
 from data_synth.jit import jit
 from data_synth.media import GRID
 from data_synth.traverse import cells, traversal
@@ -44,8 +54,10 @@ class LevelSet(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """All solids of a scene, arrays one behind the other. numbers: (n, 10) material, lo, cell, bricks; first: (n + 1, 2)."""
+    """All solids of a scene, arrays one behind the other. code: address of ``_answer``, 0 where there is no solid; numbers:
+    (n, 10) material, lo, cell, bricks; first: (n + 1, 2)."""
 
+    code: int
     numbers: np.ndarray
     first: np.ndarray
     offsets: np.ndarray
@@ -73,7 +85,8 @@ def collected(level_sets: Sequence[LevelSet]) -> Levels:
         numbers[k] = [s.material, *s.lo, *s.cell, *s.bricks]
         first[k + 1] = first[k] + [len(s.offsets), len(s.samples)]
     offsets = np.concatenate([np.zeros(0, np.int64), *(s.offsets for s in level_sets)])
-    return Levels(numbers, first, offsets, np.concatenate([np.zeros(0, np.float32), *(s.samples for s in level_sets)]))
+    samples = np.concatenate([np.zeros(0, np.float32), *(s.samples for s in level_sets)])
+    return Levels(_address() if level_sets else 0, numbers, first, offsets, samples)
 
 
 @jit
@@ -200,3 +213,95 @@ def within(levels, k, p):
         return False
     where = cell_at(m, p)
     return where[0] == INSIDE if where[0] < 0 else mixed(m.samples, 1, 0, where) < 0.0
+
+
+HIT, WITHIN = range(2)
+POINTERS = tuple(types.CPointer(t) for t in (types.float64, types.int64, types.int64, types.float32))
+SIGNATURE = types.void(*[types.int64] * 3, *POINTERS, *[types.float64] * 7, types.CPointer(types.float64))
+
+
+def _answer(mode, k, n, numbers, first, offsets, samples, ox, oy, oz, dx, dy, dz, t_max, out):
+    """``hit_level_set`` or ``within`` of solid k of n, as C calls it: arrays by their addresses, the answer in out[0..3]."""
+    starts = numba.carray(first, (n + 1, 2))
+    own = Levels(
+        0, numba.carray(numbers, (n, 10)), starts, numba.carray(offsets, (starts[n, 0],)),
+        numba.carray(samples, (starts[n, 1],)),
+    )  # fmt: skip
+    answer = numba.carray(out, (4,))
+    if mode == WITHIN:
+        answer[0] = 1.0 if within(own, k, (ox, oy, oz)) else 0.0
+    else:
+        t, normal = hit_level_set(own, k, ((ox, oy, oz), (dx, dy, dz)), t_max)
+        answer[0], answer[1], answer[2], answer[3] = t, normal[0], normal[1], normal[2]
+
+
+@cache
+def _code() -> Any:
+    """``_answer`` as machine code, kept on disk as kernels are."""
+    code = CFunc(_answer, (SIGNATURE.args, SIGNATURE.return_type), {}, {"error_model": "numpy"})
+    code.enable_caching()
+    index = getattr(code._cache, "_cache_file", None)
+    if hasattr(index, "_source_stamp"):
+        index._source_stamp = compiling._stamp(__file__)  # see ``jit.kernel``
+    code.compile()
+    return code
+
+
+def _address() -> int:
+    return 0 if numba.config.DISABLE_JIT else int(cast(int, _code().address))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@intrinsic
+def _ask(typing: Any, code: Any, mode: Any, k: Any, numbers: Any, first: Any, offsets: Any, samples: Any, numbers_of: Any) -> Any:
+    """Call ``_answer`` at an address; numbers_of: o, d and t_max."""
+    asked = (types.int64, mode, k, numbers, first, offsets, samples, types.UniTuple(types.float64, 7))
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        number, whole = ir.DoubleType(), ir.IntType(64)
+        pointers = [t.as_pointer() for t in (number, whole, whole, ir.FloatType())]
+        kind = ir.FunctionType(ir.VoidType(), [whole] * 3 + pointers + [number] * 7 + [number.as_pointer()])
+        arrays = [
+            context.make_array(t)(context, builder, value=a) for t, a in zip(signature.args[3:7], args[3:7], strict=True)
+        ]
+        out = cgutils.alloca_once(builder, number, size=4)
+        mode, k = (context.cast(builder, a, t, types.int64) for a, t in zip(args[1:3], signature.args[1:3], strict=True))
+        n = builder.extract_value(arrays[0].shape, 0)
+        plain = [builder.bitcast(a.data, t) for a, t in zip(arrays, pointers, strict=True)]
+        seven = [builder.extract_value(args[7], i) for i in range(7)]
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), [mode, k, n, *plain, *seven, out])
+        found = [builder.load(builder.gep(out, [ir.Constant(ir.IntType(32), i)])) for i in range(4)]
+        return context.make_tuple(builder, signature.return_type, found)
+
+    return types.UniTuple(types.float64, 4)(*asked), generate
+
+
+def crossing(levels: Levels, k: int, ray: Any, t_max: float) -> Any:
+    """``hit_level_set``, for renderers."""
+    return hit_level_set(levels, k, ray, t_max)
+
+
+@overload(crossing)
+def _compiled_crossing(levels, k, ray, t_max):
+    def asked(levels, k, ray, t_max):
+        o, d = ray
+        v = levels
+        seven = (o[0], o[1], o[2], d[0], d[1], d[2], t_max)
+        t, x, y, z = _ask(v.code, HIT, k, v.numbers, v.first, v.offsets, v.samples, seven)
+        return t, (x, y, z)
+
+    return asked
+
+
+def inside_of(levels: Levels, k: int, p: Any) -> bool:
+    """``within``, for renderers."""
+    return within(levels, k, p)
+
+
+@overload(inside_of)
+def _compiled_inside(levels, k, p):
+    def asked(levels, k, p):
+        v = levels
+        seven = (p[0], p[1], p[2], 0.0, 0.0, 1.0, 0.0)
+        return _ask(v.code, WITHIN, k, v.numbers, v.first, v.offsets, v.samples, seven)[0] > 0.0
+
+    return asked

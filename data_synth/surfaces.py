@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_synth.checks import direction, vector
-from data_synth.crossings import Levels, LevelSet, collected, hit_level_set
+from data_synth.crossings import Levels, LevelSet, collected, crossing
 from data_synth.errors import InputError
 from data_synth.jit import jit
 from data_synth.vec import RELATIVE, along, cross, dot, extent, slab, sub, unit
@@ -208,7 +208,7 @@ def intersect(g, ray, t_max):
             best, material = t, int(r[0])
             n = unit(cross((r[4], r[5], r[6]), (r[7], r[8], r[9])))
     for k in range(g.levels.numbers.shape[0]):
-        t, m = hit_level_set(g.levels, k, ray, best)
+        t, m = crossing(g.levels, k, ray, best)
         if t < best:
             best, n, material = t, m, int(g.levels.numbers[k, 0])
     return best, n, material

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from data_synth import materials as stuff
-from data_synth.crossings import within
+from data_synth.crossings import inside_of
 from data_synth.jit import jit
 from data_synth.lights import hit_quad
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE, Materials
@@ -79,7 +79,7 @@ def inside_at(w, p):
             inside = crossing(row, inside, True)
     for k in range(g.levels.numbers.shape[0]):
         row = rows[int(g.levels.numbers[k, 0])]
-        if row[0] >= DIELECTRIC and row[15] >= 0.0 and within(g.levels, k, p):
+        if row[0] >= DIELECTRIC and row[15] >= 0.0 and inside_of(g.levels, k, p):
             inside = crossing(row, inside, True)
     if g.triangles.shape[0] == 0:
         return inside
