@@ -28,10 +28,11 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.ccallback import CFunc
 from numba.extending import intrinsic, overload
+from numba.np.numpy_support import carray
 
+from data_synth import jit as compiling
 from data_synth.bricks import SIDE
 from data_synth.fields import cell_at, mixed
-from data_synth import jit as compiling
 from data_synth.jit import jit
 from data_synth.media import GRID
 from data_synth.traverse import cells, traversal
@@ -222,12 +223,12 @@ SIGNATURE = types.void(*[types.int64] * 3, *POINTERS, *[types.float64] * 7, type
 
 def _answer(mode, k, n, numbers, first, offsets, samples, ox, oy, oz, dx, dy, dz, t_max, out):
     """``hit_level_set`` or ``within`` of solid k of n, as C calls it: arrays by their addresses, the answer in out[0..3]."""
-    starts = numba.carray(first, (n + 1, 2))
+    starts = carray(first, (n + 1, 2))
     own = Levels(
-        0, numba.carray(numbers, (n, 10)), starts, numba.carray(offsets, (starts[n, 0],)),
-        numba.carray(samples, (starts[n, 1],)),
+        0, carray(numbers, (n, 10)), starts, carray(offsets, (starts[n, 0],)),
+        carray(samples, (starts[n, 1],)),
     )  # fmt: skip
-    answer = numba.carray(out, (4,))
+    answer = carray(out, (4,))
     if mode == WITHIN:
         answer[0] = 1.0 if within(own, k, (ox, oy, oz)) else 0.0
     else:
@@ -240,20 +241,22 @@ def _code() -> Any:
     """``_answer`` as machine code, kept on disk as kernels are."""
     code = CFunc(_answer, (SIGNATURE.args, SIGNATURE.return_type), {}, {"error_model": "numpy"})
     code.enable_caching()
-    index = getattr(code._cache, "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
+    index: Any = getattr(getattr(code, "_cache", None), "_cache_file", None)
+    if index is not None and hasattr(index, "_source_stamp"):
         index._source_stamp = compiling._stamp(__file__)  # see ``jit.kernel``
     code.compile()
     return code
 
 
 def _address() -> int:
-    return 0 if numba.config.DISABLE_JIT else int(cast(int, _code().address))  # pyright: ignore[reportAttributeAccessIssue]
+    return 0 if numba.config.DISABLE_JIT else int(cast(int, _code().address))  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]
 
 
 @intrinsic
-def _ask(typing: Any, code: Any, mode: Any, k: Any, numbers: Any, first: Any, offsets: Any, samples: Any, numbers_of: Any) -> Any:
-    """Call ``_answer`` at an address; numbers_of: o, d and t_max."""
+def _ask(
+    typing: Any, code: Any, mode: Any, k: Any, numbers: Any, first: Any, offsets: Any, samples: Any, seven: Any
+) -> Any:
+    """Call ``_answer`` at an address; seven: o, d and t_max."""
     asked = (types.int64, mode, k, numbers, first, offsets, samples, types.UniTuple(types.float64, 7))
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -261,10 +264,13 @@ def _ask(typing: Any, code: Any, mode: Any, k: Any, numbers: Any, first: Any, of
         pointers = [t.as_pointer() for t in (number, whole, whole, ir.FloatType())]
         kind = ir.FunctionType(ir.VoidType(), [whole] * 3 + pointers + [number] * 7 + [number.as_pointer()])
         arrays = [
-            context.make_array(t)(context, builder, value=a) for t, a in zip(signature.args[3:7], args[3:7], strict=True)
+            context.make_array(t)(context, builder, value=a)
+            for t, a in zip(signature.args[3:7], args[3:7], strict=True)
         ]
         out = cgutils.alloca_once(builder, number, size=4)
-        mode, k = (context.cast(builder, a, t, types.int64) for a, t in zip(args[1:3], signature.args[1:3], strict=True))
+        mode, k = (
+            context.cast(builder, a, t, types.int64) for a, t in zip(args[1:3], signature.args[1:3], strict=True)
+        )
         n = builder.extract_value(arrays[0].shape, 0)
         plain = [builder.bitcast(a.data, t) for a, t in zip(arrays, pointers, strict=True)]
         seven = [builder.extract_value(args[7], i) for i in range(7)]
@@ -286,7 +292,7 @@ def _compiled_crossing(levels, k, ray, t_max):
         o, d = ray
         v = levels
         seven = (o[0], o[1], o[2], d[0], d[1], d[2], t_max)
-        t, x, y, z = _ask(v.code, HIT, k, v.numbers, v.first, v.offsets, v.samples, seven)
+        t, x, y, z = _ask(v.code, HIT, k, v.numbers, v.first, v.offsets, v.samples, seven)  # pyright: ignore[reportCallIssue]
         return t, (x, y, z)
 
     return asked
@@ -302,6 +308,6 @@ def _compiled_inside(levels, k, p):
     def asked(levels, k, p):
         v = levels
         seven = (p[0], p[1], p[2], 0.0, 0.0, 1.0, 0.0)
-        return _ask(v.code, WITHIN, k, v.numbers, v.first, v.offsets, v.samples, seven)[0] > 0.0
+        return _ask(v.code, WITHIN, k, v.numbers, v.first, v.offsets, v.samples, seven)[0] > 0.0  # pyright: ignore[reportCallIssue]
 
     return asked

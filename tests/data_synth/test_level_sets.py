@@ -1,12 +1,24 @@
-"""Level sets out of files, in scenes, in pictures: what a sphere of OpenVDB's own makes, written by its createLevelSetSphere."""
+"""Level sets out of files, in scenes and in pictures: a sphere that OpenVDB itself wrote."""
 
 import os
 from pathlib import Path as File
+from typing import Any
 
 import numpy as np
 import pytest
 
-from data_synth import InputError, March, Path, RenderWarning, jit, level_sets, lights, materials, scene_file, surfaces, truth
+from data_synth import (
+    InputError,
+    March,
+    Path,
+    jit,
+    level_sets,
+    lights,
+    materials,
+    scene_file,
+    surfaces,
+    truth,
+)
 from data_synth.scene import Scene
 from data_synth.vdb import read_level_set, read_vdb
 from data_synth.vdb_write import SparseGrid, write_grids
@@ -36,7 +48,8 @@ def test_it_is_placed_and_scaled():
     solid = level_sets.level_set(0, BALL, size=1.0, centre=(5.0, 0.0, -1.0))
     lo, hi = level_sets.extent_of(solid)
     assert (hi - lo).max() == pytest.approx(1.0) and (lo + hi) / 2 == pytest.approx([5.0, 0.0, -1.0])
-    for wrong in ({"size": 0.0}, {"size": np.inf}, {"centre": (1, 2)}, {"grid": "none"}):
+    wrongs: list[dict[str, Any]] = [{"size": 0.0}, {"size": np.inf}, {"centre": (1, 2)}, {"grid": "none"}]
+    for wrong in wrongs:
         with pytest.raises(InputError):
             level_sets.level_set(0, BALL, **wrong)
 
@@ -51,7 +64,10 @@ def test_it_looks_like_a_sphere(integrator):
     """Colour, alpha and distance of a matt ball under a sun and over a floor, against ``surfaces.sphere``, in pixels whose ray
     comes no nearer to the rim than the interpolation's error."""
     floor = surfaces.plane(1, (0, 0, -1.2), (0, 0, 1))
-    common = {"materials": [RED, materials.lambert(0.6)], "lights": [lights.directional((0.3, -0.5, 1.0), 3.0)]}
+    common: dict[str, Any] = {
+        "materials": [RED, materials.lambert(0.6)],
+        "lights": [lights.directional((0.3, -0.5, 1.0), 3.0)],
+    }
     solid = level_sets.level_set(0, BALL, centre=(0, 0, 0))
     off = CENTRE - np.sum(level_sets.extent_of(level_sets.level_set(0, BALL)), axis=0) / 2  # its box is one of samples
     scene = Scene(shapes=[floor], level_sets=[solid], **common)
@@ -61,12 +77,18 @@ def test_it_looks_like_a_sphere(integrator):
     assert np.array_equal(a.alpha, b.alpha)
     far = abs(a.distance - b.distance)
     met = far > 1e-9
-    assert 20 < met.sum() < 200 and np.median(far[met]) < 2 * SHRINKS and np.mean(abs(a.rgb - b.rgb)[met]) < 0.1 * b.rgb.mean()
+    assert (
+        20 < met.sum() < 200
+        and np.median(far[met]) < 2 * SHRINKS
+        and np.mean(abs(a.rgb - b.rgb)[met]) < 0.1 * b.rgb.mean()
+    )
     assert np.allclose(a.rgb[~met], b.rgb[~met], atol=0.15) and np.mean(abs(a.rgb - b.rgb)[~met]) < 0.05 * b.rgb.mean()
 
 
 def test_pictures_do_not_depend_on_threads_and_do_on_seeds():
-    scene = Scene(level_sets=[level_sets.level_set(0, BALL, centre=(0, 0, 0), size=1.5)], lights=[lights.environment(1.0)])
+    scene = Scene(
+        level_sets=[level_sets.level_set(0, BALL, centre=(0, 0, 0), size=1.5)], lights=[lights.environment(1.0)]
+    )
     scene.materials = [materials.dielectric(1.4)]
     camera, pictures = scene.viewpoints.camera(30, 25, 12, 12), []
     for threads, seed in ((1, 1), (2, 1), (1, 2)):
@@ -111,9 +133,13 @@ def test_a_changed_solid_is_another_scene():
 def test_a_level_set_is_no_density(tmp_path, command):
     """It is refused with the way to show it, whatever asks; beside a density it is left out, with a word."""
     for read in (open_volume, read_volume):
-        with pytest.raises(InputError, match=r"grid ball is a level set: .*shapes: \[{level_set: {material: ..., file: ball.vdb}}\]"):
+        with pytest.raises(
+            InputError, match=r"grid ball is a level set: .*shapes: \[{level_set: {material: ..., file: ball.vdb}}\]"
+        ):
             read(BALL)
-    code, _, said = command("synth", "smoke", "--volume", BALL, "--views", "1", "--size", "8x8", "--out", tmp_path / "s")
+    code, _, said = command(
+        "synth", "smoke", "--volume", BALL, "--views", "1", "--size", "8x8", "--out", tmp_path / "s"
+    )
     assert code == 2 and "is a level set" in said and len(said.splitlines()) == 1
     assert read_vdb(BALL).values.min() < 0  # who reads arrays gets them
     cube = np.argwhere(np.ones((4, 4, 4)))
