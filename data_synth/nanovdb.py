@@ -84,7 +84,7 @@ def contents(path: str | os.PathLike) -> tuple[Reader, dict[str, Stored], list[s
             raise r.fail("the first bytes are another format's")
         version, count, codec = r.number("I"), r.number("H"), r.number("H")
         if version >> 21 != MAJOR:
-            raise r.fail(f"its layout is version {version >> 21}, not {MAJOR}")
+            raise r.fail(f"its layout is version {version >> 21}, not {MAJOR}: nanovdb_convert makes a .vdb of it")
         if codec >= len(CODECS):
             raise r.fail(f"its codec is number {codec}")
         listed = [_listed(r, codec) for _ in range(count)]
