@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from data_synth import (
         channels,
         clouds,
+        level_sets,
         lights,
         materials,
         media,
@@ -45,9 +46,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera", "DeepShadow", "Emission", "InputError", "March", "Options", "Path", "Picture", "Preview", "RayCast",
-    "RenderWarning", "Scene", "Viewpoints", "channels", "clouds", "lights", "load_scene", "look_at", "materials", "media",
-    "microflakes", "phase", "raycast", "read_exr", "render", "render_view", "sample_flights", "sample_transmittance", "scenes",
-    "sggx", "spongecake", "surfaces", "volumes", "weather", "write_dataset", "write_exr", "write_png",
+    "RenderWarning", "Scene", "Viewpoints", "channels", "clouds", "level_sets", "lights", "load_scene", "look_at", "materials",
+    "media", "microflakes", "phase", "raycast", "read_exr", "render", "render_view", "sample_flights", "sample_transmittance",
+    "scenes", "sggx", "spongecake", "surfaces", "volumes", "weather", "write_dataset", "write_exr", "write_png",
 ]  # fmt: skip
 
 _HOMES = {

@@ -1,4 +1,4 @@
-"""The figures of docs/data_synth.md: ``nerfvol synth bench [one|sky|preview|views|mitsuba]``.
+"""The figures of docs/data_synth.md: ``nerfvol synth bench [one|sky|preview|views|mitsuba] [--fork PYTHON] [--size N]``.
 
 Times are wall-clock and CPU seconds (all threads) of whole renders of one view: everything that depends on the lights
 (shadow maps) is made again in each of the repetitions, of which the median counts. ``view`` is a further view of the
@@ -9,6 +9,7 @@ rays and a quarter of the step.
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import sys
@@ -133,16 +134,30 @@ def views() -> None:
     print(f"117 views (100 training, 5 validation, 12 testing): {wall:.1f} s, {cpu:.1f} CPU s")
 
 
-def mitsuba() -> None:
-    """Path tracing side by side with Mitsuba 3."""
-    bench_mitsuba.main(cumulus(EVENING_SUN))
+def mitsuba(fork: str | None = None, size: int = bench_mitsuba.SIZE) -> None:
+    """Path tracing side by side with Mitsuba 3, and with its fork where ``fork`` names a Python that has it."""
+    bench_mitsuba.main(cumulus(EVENING_SUN), fork, size)
 
 
-BENCHES = {"one": one, "sky": sky, "preview": preview, "views": views, "mitsuba": mitsuba}
+BENCHES: dict[str, Callable[..., None]] = {
+    "one": one,
+    "sky": sky,
+    "preview": preview,
+    "views": views,
+    "mitsuba": mitsuba,
+}
 
 
-def main(names: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Run the named benchmarks, or all."""
+    p = argparse.ArgumentParser("nerfvol synth bench", description="the figures of docs/data_synth.md")
+    p.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHES))
+    p.add_argument("--fork", metavar="PYTHON", help="mitsuba: an interpreter that has eradiate-mitsuba, for its rows")
+    p.add_argument("--size", type=int, default=bench_mitsuba.SIZE, metavar="N", help="mitsuba: pixels a side")
+    args = p.parse_args(arguments)
+    names = args.names
+    if args.size < 1:
+        raise InputError(f"bench: --size expects a number of pixels, got {args.size}")
     for name in names:
         if name not in BENCHES:
             raise InputError(f"bench: expected one of {', '.join(BENCHES)}, got '{name}'")
@@ -151,7 +166,10 @@ def main(names: list[str]) -> int:
         f"{platform.machine()}, {core_count()} cores, load before the start {load}, Python {platform.python_version()}"
     )
     for name in names or BENCHES:
-        BENCHES[name]()
+        if name == "mitsuba":
+            mitsuba(args.fork, args.size)
+        else:
+            BENCHES[name]()
     return 0
 
 

@@ -63,7 +63,7 @@ def parser(details: str = "") -> argparse.ArgumentParser:
     p.add_argument(
         "--volume",
         metavar="FILE",
-        help="a density volume (.vdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
+        help="a density volume (.vdb, .nvdb, .vdb:GRID, .npz, .raw, .nrrd, .nii, .mhd) for scenes that take one",
     )
     p.add_argument(
         "--denoise", action="store_true", help="with --picture: without noise, by Open Image Denoise (an extra)"

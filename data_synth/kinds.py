@@ -10,6 +10,7 @@ import numpy as np
 from data_synth import (
     channels,
     clouds,
+    level_sets,
     lights,
     materials,
     media,
@@ -89,7 +90,9 @@ KINDS: dict[str, dict[str, Callable]] = {
     "material": {f.__name__: f for f in (
         materials.lambert, materials.blinn_phong, materials.dielectric, materials.null, layered,
     )},
-    "shape": {f.__name__: f for f in (surfaces.plane, surfaces.sphere, surfaces.box, surfaces.mesh)},
+    "shape": {f.__name__: f for f in (
+        surfaces.plane, surfaces.sphere, surfaces.box, surfaces.mesh, level_sets.level_set,
+    )},
     "light": {f.__name__: f for f in (lights.point, lights.directional, lights.quad, lights.environment, lights.sky)},
     "layer": {"layer": spongecake.layer},
 }  # fmt: skip

@@ -33,11 +33,11 @@ class Scene:
     """What can be rendered.
 
     medium: a ``media`` medium or None, number 0; media: further ones, numbers 1, 2, ... shapes, triangles: rows of
-    ``surfaces`` whose material numbers index ``materials``; layers: rows of ``spongecake.layer``. lights: rows of
-    ``lights``. bounded: whether the medium fills the closed shapes with a ``null`` or ``dielectric`` material and nothing
-    else; if not it fills its whole box, except for what is inside glass. A boundary material that names a medium itself
-    holds that one in both cases. opaque_sky: the picture shows the sky instead of being transparent there. integrators:
-    by name, the first is the scene's own choice. exposure scales the colours of 8-bit pictures.
+    ``surfaces`` whose material numbers index ``materials``; level_sets: solids made by ``level_sets``; layers: rows of
+    ``spongecake.layer``. lights: rows of ``lights``. bounded: whether the medium fills the closed shapes with a ``null`` or
+    ``dielectric`` material and nothing else; if not it fills its whole box, except for what is inside glass. A boundary
+    material that names a medium itself holds that one in both cases. opaque_sky: the picture shows the sky instead of being
+    transparent there. integrators: by name, the first is the scene's own choice. exposure scales the colours of 8-bit pictures.
     classified: the scan that the medium was made of, for ``raycast``.
 
     All of it may be changed between two renders; what integrators keep is made again then.
@@ -58,6 +58,7 @@ class Scene:
     exposure: float = 1.0
     parameters: dict = field(default_factory=dict)
     media: list = field(default_factory=list)
+    level_sets: list = field(default_factory=list)
     classified: Classified | None = None
     prepared: dict[object, Prepared] = field(default_factory=dict, init=False, repr=False, compare=False)
     """What integrators keep for the next view: arrays and shadow maps, which do not depend on the camera."""
@@ -79,7 +80,7 @@ class Scene:
         glows = any(media.glows(m) for m in (self.medium, *self.media) if isinstance(m, media.Medium))
         if not rows and not glows:
             warnings.warn(f"scene {self.name} has no lights: the picture is black", RenderWarning, stacklevel=3)
-        shapes = surfaces.geometry(self.shapes, self.triangles)
+        shapes = surfaces.geometry(self.shapes, self.triangles, self.level_sets)
         own = _table(self.lights, lamps.WIDTH)
         return World(
             self.medium if self.medium is not None else NOTHING,
@@ -94,7 +95,7 @@ class Scene:
 
     def boundaries(self) -> np.ndarray:
         """The material table, with the media and counters of those boundaries that are used."""
-        numbers = [int(row[1]) for row in self.shapes]
+        numbers = [int(row[1]) for row in self.shapes] + [s.material for s in self.level_sets]
         numbers += [] if self.triangles is None else [int(k) for k in np.unique(self.triangles[:, 0])]
         used, rows = set(numbers), _table(self.materials, 16)
         if used and max(used) >= len(rows):
@@ -119,6 +120,7 @@ class Scene:
         """A digest of all that a picture depends on but the camera: it tells whether the scene was changed."""
         digest = hashlib.blake2b(repr((self.bounded, self.opaque_sky)).encode())
         parts: list = [self.shapes, self.materials, self.layers, self.lights, self.triangles, self.medium, *self.media]
+        parts += self.level_sets
         while parts:
             part = parts.pop()
             if isinstance(part, media.Medium):

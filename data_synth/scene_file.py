@@ -30,6 +30,7 @@ import yaml
 
 from data_synth import materials, scenes
 from data_synth.cameras import Viewpoints
+from data_synth.crossings import LevelSet
 from data_synth.errors import InputError
 from data_synth.integrators import INTEGRATORS
 from data_synth.kinds import KINDS
@@ -100,8 +101,10 @@ class _File:
             scene.materials.append(self.make("material", given, f"materials.{name}"))
             self.materials[name] = k
         made = [self.make("shape", s, f"shapes[{k}]") for k, s in enumerate(self.sequence("shapes", top))]
-        scene.shapes = [s for s in made if s.ndim == 1]
-        meshes = [s for s in made if s.ndim == 2]
+        scene.level_sets = [s for s in made if isinstance(s, LevelSet)]
+        arrays = [s for s in made if not isinstance(s, LevelSet)]
+        scene.shapes = [s for s in arrays if s.ndim == 1]
+        meshes = [s for s in arrays if s.ndim == 2]
         scene.triangles = np.concatenate(meshes) if meshes else None
         scene.layers = self.layers
         scene.lights = [self.make("light", s, f"lights[{k}]") for k, s in enumerate(self.sequence("lights", top))]
@@ -212,7 +215,7 @@ class _File:
             if not isinstance(value, str):
                 raise self.fail(where, f"expected a file name, got {value}")
             return str(self.path.parent / value)
-        if key in ("back", "kind", "micro"):
+        if key in ("back", "kind", "micro") or (key == "grid" and isinstance(value, str)):
             return value
         if key in ("diffuse", "fibre", "schlick"):
             if not isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Surfaces: planes, spheres, boxes and triangles, and the materials on them (PHYSICS 9).
+"""Surfaces: planes, spheres, boxes, triangles and level sets (``crossings.py``), and the materials on them (PHYSICS 9).
 
 A shape table is a (n, 12) float array: kind, material, numbers. Triangles stand in a second table, (m, 12):
 material, corner, edge, edge, and are found through a bounding volume hierarchy. A hit's normal points *out* of closed
@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from data_synth.checks import direction, vector
+from data_synth.crossings import Levels, LevelSet, collected, crossing
 from data_synth.errors import InputError
 from data_synth.jit import jit
-from data_synth.vec import along, cross, dot, extent, slab, sub, unit
+from data_synth.vec import RELATIVE, along, cross, dot, extent, slab, sub, unit
 
 PLANE, SPHERE, BOX = range(3)
-RELATIVE = 1e-9  # hits nearer than this times the size of what takes part are the surface a ray starts on
 LEAF = 4
 
 
@@ -31,6 +31,7 @@ class Geometry(NamedTuple):
     shapes: np.ndarray
     triangles: np.ndarray
     bvh: np.ndarray
+    levels: Levels
 
 
 def plane(material: int, point: ArrayLike, normal: ArrayLike) -> np.ndarray:
@@ -76,11 +77,13 @@ def _shape(kind: int, material: int, *columns: ArrayLike) -> np.ndarray:
     return row
 
 
-def geometry(shapes: Sequence[np.ndarray] = (), triangles: np.ndarray | None = None) -> Geometry:
-    """Collect shapes, and triangles in a hierarchy (median split along the longest side)."""
-    table = np.array(shapes, float).reshape(-1, 12)
+def geometry(
+    shapes: Sequence[np.ndarray] = (), triangles: np.ndarray | None = None, level_sets: Sequence[LevelSet] = ()
+) -> Geometry:
+    """Collect shapes and level sets, and triangles in a hierarchy (median split along the longest side)."""
+    table, levels = np.array(shapes, float).reshape(-1, 12), collected(level_sets)
     if triangles is None or len(triangles) == 0:
-        return Geometry(table, np.zeros((0, 12)), np.zeros((0, 9)))
+        return Geometry(table, np.zeros((0, 12)), np.zeros((0, 9)), levels)
     corners = triangles[:, None, 1:4] + np.stack(
         [np.zeros_like(triangles[:, 1:4]), triangles[:, 4:7], triangles[:, 7:10]], axis=1
     )
@@ -103,7 +106,7 @@ def geometry(shapes: Sequence[np.ndarray] = (), triangles: np.ndarray | None = N
         nodes[index][8] = len(nodes)
 
     build(0, len(order))
-    return Geometry(table, np.ascontiguousarray(triangles[order]), np.array(nodes, float))
+    return Geometry(table, np.ascontiguousarray(triangles[order]), np.array(nodes, float), levels)
 
 
 @jit
@@ -204,6 +207,10 @@ def intersect(g, ray, t_max):
             r = g.triangles[which]
             best, material = t, int(r[0])
             n = unit(cross((r[4], r[5], r[6]), (r[7], r[8], r[9])))
+    for k in range(g.levels.numbers.shape[0]):
+        t, m = crossing(g.levels, k, ray, best)
+        if t < best:
+            best, n, material = t, m, int(g.levels.numbers[k, 0])
     return best, n, material
 
 

@@ -24,6 +24,8 @@
 | ``mediumK_g_grid``, ``_S_grid``         | (nx, ny, nz) in place of g1, (nx, ny, nz, 6) in place of S, where they vary |
 | ``number``, ``number_lo``, ``number_hi``| medium at each vertex of a grid, -1 for none; media are cut by boundaries   |
 | ``shapes``, ``triangles``, ``materials``| tables as ``surfaces`` and ``materials`` describe them                      |
+| ``solidK_material``, ``_lo``,        | of each level set (``crossings.py``): (3,) lowest vertex and edges of a cell, |
+|  ``_cell``, ``_offsets``, ``_samples``| (bx, by, bz) first sample of each brick of 8^3 cells, -1: outside, -2: inside |
 | ``layers``, ``layers_D``, ``lights``    | tables as ``spongecake``, ``microflakes`` and ``lights`` describe them       |
 """
 
@@ -34,8 +36,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from data_synth import level_sets, media, microflakes, spongecake, surfaces
 from data_synth import materials as stuff
-from data_synth import media, microflakes, spongecake, surfaces
 from data_synth import phase as phases
 from data_synth.channels import Channels
 from data_synth.detail import Detail
@@ -62,6 +64,9 @@ def write(scene: Scene, path: Path) -> None:
             arrays |= {f"medium{k}_{name}": np.asarray(value) for name, value in described.items()}
     lo, hi, number = numbers(scene)
     geometry, layers = surfaces.geometry(scene.shapes, scene.triangles), spongecake.stack(scene.layers)
+    for k, s in enumerate(scene.level_sets):
+        described = s._asdict() | {"offsets": s.offsets.reshape(s.bricks)}
+        arrays |= {f"solid{k}_{name}": np.asarray(value) for name, value in described.items() if name != "bricks"}
     arrays |= {
         "number": number, "number_lo": lo, "number_hi": hi, "shapes": geometry.shapes, "triangles": geometry.triangles,
         "materials": scene.boundaries(), "layers": layers.rows, "layers_D": layers.table.D,
@@ -166,7 +171,7 @@ def described(scene: Scene) -> dict[str, dict[str, object]]:
 def numbers(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(lo, hi, (nx, ny, nz) int8): the number of the medium at the vertices of a grid over the media's boxes.
 
-    Boundaries are spheres, boxes and half-spaces; those made of triangles count as the ambient medium.
+    Boundaries are spheres, boxes, half-spaces and level sets; those made of triangles count as the ambient medium.
     """
     boxes = [(m.lo, m.hi) for m in (scene.medium, *scene.media) if m is not None] or [tuple(scene.aabb)]
     lo, hi = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
@@ -177,10 +182,12 @@ def numbers(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ambient = stuff.CLEAR if scene.bounded or scene.medium is None else 0
     number, best = np.full(p.shape[:3], ambient, np.int8), np.full(p.shape[:3], -np.inf)
     rows, shapes = scene.boundaries(), surfaces.geometry(scene.shapes).shapes
-    for shape in sorted(shapes, key=lambda shape: shape[1]):  # of equal priorities the later material counts
-        row = rows[int(shape[1])]
+    solids = [(int(shape[1]), shape, _holds) for shape in shapes]
+    solids += [(s.material, s, level_sets.holds) for s in scene.level_sets]
+    for material, shape, holds in sorted(solids, key=lambda solid: solid[0]):  # of equal priorities the later counts
+        row = rows[material]
         if row[0] in (stuff.DIELECTRIC, stuff.NULL) and row[15] >= 0:
-            here = _holds(shape, p) & (row[14] >= best)
+            here = holds(shape, p) & (row[14] >= best)
             number[here], best[here] = row[13], row[14]
     for k, m in enumerate((scene.medium, *scene.media)):
         if m is not None:

@@ -26,15 +26,15 @@ LARGEST_RATIO = 1024
 """Beyond, bytes of a dense result for each of the file: what deflate makes of zeros at most, and far more than clouds take
 (a few dozen). Two voxels far apart would fill any memory."""
 # per-node code of how inactive values are stored
-ONE_INACTIVE, MASK_NONE, MASK_ONE, MASK_TWO, ALL_VALUES = 2, 3, 4, 5, 6
+MINUS, ONE_INACTIVE, MASK_NONE, MASK_ONE, MASK_TWO, ALL_VALUES = 1, 2, 3, 4, 5, 6
 
 
 class Reader:
     def __init__(self, data: bytes, path: str | os.PathLike) -> None:
         self.data, self.at, self.path = data, 0, path
 
-    def fail(self, what: str) -> InputError:
-        return InputError(f"{self.path}: expected an OpenVDB float volume, {what}")
+    def fail(self, what: str, wanted: str = "float volume") -> InputError:
+        return InputError(f"{self.path}: expected an OpenVDB {wanted}, {what}")
 
     def take(self, n: int) -> bytes:
         if n < 0 or self.at + n > len(self.data):
@@ -73,12 +73,15 @@ class Tree:
         self.r, self.flags, self.half, self.channels = r, flags, half, channels
         self.background = self._value()
         self.boxes: list[tuple[np.ndarray, int, Any]] = []  # active tiles: origin, edge, value
+        self.inside: list[tuple[np.ndarray, int, np.ndarray]] = []  # tiles below 0: (n, 3) origins, edge, (n,) values
         self.leaves: list[np.ndarray] = []
         tiles, children = r.number("I"), r.number("I")
         for _ in range(tiles):
             origin, value, active = r.numbers("<i4", 3), self._value(), r.number("?")
             if active:
                 self.boxes.append((origin, 4096, value))
+            if channels == 1 and value < 0:
+                self.inside.append((origin[None].astype(np.int64), 4096, np.array([value], np.float32)))
         for _ in range(children):
             self._internal(r.numbers("<i4", 3).astype(np.int64), 5)
         one = (512,) if channels == 1 else (512, channels)
@@ -96,6 +99,8 @@ class Tree:
         place = np.stack(np.unravel_index(np.arange(n**3), (n, n, n)), axis=1) * edge + origin
         for k in np.flatnonzero(active & ~child):
             self.boxes.append((place[k], edge, values[k]))
+        if self.channels == 1 and (below := (values < 0) & ~child).any():
+            self.inside.append((place[below], edge, values[below]))
         for k in np.flatnonzero(child):
             if log2 == 5:
                 self._internal(place[k], 4)
@@ -107,14 +112,12 @@ class Tree:
         """The n values of a node and its active mask, undoing active-mask compression."""
         r = self.r
         code = r.number("b")
-        low = self.background
-        high = self.background if code == 0 else -self.background
+        low = -self.background if code in (MINUS, MASK_NONE) else self.background  # of inactive values that are not chosen
+        high = self.background
         if code in (ONE_INACTIVE, MASK_ONE, MASK_TWO):
             low = self._value()
-            high = self._value() if code == MASK_TWO else high if code == ONE_INACTIVE else self.background
+            high = self._value() if code == MASK_TWO else high
         chosen = r.mask(n) if code in (MASK_NONE, MASK_ONE, MASK_TWO) else np.zeros(n, bool)
-        if code == 1:
-            low = -self.background
         if code == ALL_VALUES:
             return self._numbers(n), active
         chosen = chosen if self.channels == 1 else chosen[:, None]
@@ -167,7 +170,7 @@ class Tree:
             raise self.r.fail("it has no active voxel")
         return np.min(low, axis=0), np.max(high, axis=0)
 
-    def _refuse(self, size: np.ndarray, bytes_: float, what: str) -> None:
+    def refuse(self, size: np.ndarray, bytes_: float, what: str) -> None:
         """Files of a few bytes must not ask for gigabytes."""
         if bytes_ > 4 * LIMIT or (bytes_ > 4 * FREE_LIMIT and bytes_ > LARGEST_RATIO * len(self.r.data)):
             extent = "x".join(str(int(v)) for v in size)
@@ -179,7 +182,7 @@ class Tree:
         tiles = [self._tile(*box, first, last) for box in self.boxes]
         blocks = len(self.leaves) + sum(float(np.prod(counts)) for _, counts, _ in tiles)
         bricks = float(np.prod(-(-(last - first).astype(float) // 8)))
-        self._refuse(last - first, 2048.0 * self.channels * blocks + 24.0 * bricks, "blocks")
+        self.refuse(last - first, 2048.0 * self.channels * blocks + 24.0 * bricks, "blocks")
         corners = [np.array(self.leaves, np.int64).reshape(-1, 3)]
         values = [self.values.reshape(-1, 8, 8, 8, *self.values.shape[2:])]
         for start, counts, value in tiles:
@@ -198,7 +201,7 @@ class Tree:
     def dense(self) -> tuple[np.ndarray, np.ndarray]:
         """(first index, values) over the active voxels."""
         first, last = self.box()
-        self._refuse(last - first, 4.0 * self.channels * float(np.prod((last - first).astype(float))), "a dense grid")
+        self.refuse(last - first, 4.0 * self.channels * float(np.prod((last - first).astype(float))), "a dense grid")
         shape = tuple(last - first) + ((self.channels,) if self.channels > 1 else ())
         out = np.full(shape, self.background, np.float32)
 

@@ -4,6 +4,8 @@ import math
 
 from data_synth.jit import jit
 
+RELATIVE = 1e-9  # hits nearer than this times the size of what takes part are the surface a ray starts on
+
 
 @jit
 def dot(a, b):

@@ -25,7 +25,9 @@ KELVIN = 200.0
 """Temperatures of which none is above this are fractions of the hottest one."""
 LARGE = 1 << 28
 """Samples of a dense array (1 GiB) beyond which media stay in bricks."""
-KNOWN = ", ".join((".vdb", ".npz", ".npy", ".raw", *medical.SUFFIXES))
+GRIDS = (".vdb", ".nvdb")
+"""Files of named grids."""
+KNOWN = ", ".join((*GRIDS, ".npz", ".npy", ".raw", *medical.SUFFIXES))
 
 
 @dataclass
@@ -69,7 +71,7 @@ def open_volume(path: str | os.PathLike, uses: Collection[str] = ("colour", "hea
     """
     text, colon, _ = str(path).rpartition(":")
     given = Path(path)
-    if given.suffix != ".vdb" or not given.is_file() or (colon and text.endswith(".vdb")):
+    if given.suffix not in GRIDS or not given.is_file() or (colon and text.endswith(GRIDS)):
         return Volume(*read_volume(path))
     held, unknown = grid_names(given)
     found = read_blocks(given)
@@ -104,22 +106,23 @@ def open_volume(path: str | os.PathLike, uses: Collection[str] = ("colour", "hea
 
 
 def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """(samples (nx, ny, nz) float32, voxel size (3,)) of a .vdb, .npz, .npy, .raw, .mhd, .mha, .nrrd, .nii or .nii.gz file.
+    """(samples (nx, ny, nz) float32, voxel size (3,)) of a .vdb, .nvdb, .npz, .npy, .raw, .mhd, .mha, .nrrd, .nii or
+    .nii.gz file.
 
-    vdb: the grid called density, or the first; another one by its name, as in smoke.vdb:flame. npz: the array "density",
+    vdb, nvdb: the grid called density, or the first; another one by its name, as in smoke.vdb:flame. npz: the array "density",
     or the first 3D one, with an optional "voxel_size". raw: a name that ends in _NXxNYxNZ_TYPE.raw, such as
     head_256x256x128_uint8.raw, x fastest.
     """
     text, colon, name = str(path).rpartition(":")
     given = Path(path)
-    if colon and text.endswith(".vdb") and not given.exists():
+    if colon and text.endswith(GRIDS) and not given.exists():
         given = Path(text)
     else:
         name = ""
     if not given.is_file():
         raise InputError(f"{given}: expected a volume file ({KNOWN}), found no such file")
     spacing = np.ones(3)
-    if given.suffix == ".vdb":
+    if given.suffix in GRIDS:
         values, spacing = _read_grid(given, name or None)
     elif given.suffix in (".npz", ".npy"):
         values, spacing = _read_numpy(given)
@@ -133,7 +136,7 @@ def read_volume(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_grid(path: Path, name: str | None) -> tuple[np.ndarray, np.ndarray]:
-    grid = read_vdb(path, name)
+    grid = read_vdb(path, name, density=True)
     if grid.others and name is None:
         others = ", ".join(grid.others)
         notice = f"{path}: took the grid {grid.name}; {path.name}:NAME takes another ({others})"

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from data_synth import materials as stuff
+from data_synth.crossings import inside_of
 from data_synth.jit import jit
 from data_synth.lights import hit_quad
 from data_synth.materials import DIELECTRIC, NULL, SPONGECAKE, Materials
@@ -47,7 +48,8 @@ class World(NamedTuple):
 
 def has_surfaces(w: World) -> bool:
     """Whether anything but the medium and the sky can be seen."""
-    return len(w.geometry.shapes) + len(w.geometry.triangles) + len(w.quads) > 0
+    g = w.geometry
+    return len(g.shapes) + len(g.triangles) + len(g.levels.numbers) + len(w.quads) > 0
 
 
 def has_boundaries(w: World) -> bool:
@@ -74,6 +76,10 @@ def inside_at(w, p):
     for k in range(g.shapes.shape[0]):
         row = rows[int(g.shapes[k, 1])]
         if row[0] >= DIELECTRIC and row[15] >= 0.0 and contains(g.shapes[k], p):
+            inside = crossing(row, inside, True)
+    for k in range(g.levels.numbers.shape[0]):
+        row = rows[int(g.levels.numbers[k, 0])]
+        if row[0] >= DIELECTRIC and row[15] >= 0.0 and inside_of(g.levels, k, p):
             inside = crossing(row, inside, True)
     if g.triangles.shape[0] == 0:
         return inside

@@ -120,13 +120,15 @@ def test_random_damage_never_escapes(tmp_path, values):
         (0, b"", (0.5, 0.5)),
         (1, b"", (-0.5, -0.5)),
         (2, struct.pack("<f", 3.0), (3.0, 3.0)),
-        (3, bytes([0b1010] + [0] * 63), (0.5, -0.5)),
+        (3, bytes([0b1010] + [0] * 63), (-0.5, 0.5)),
         (4, struct.pack("<f", 3.0) + bytes([0b1010] + [0] * 63), (3.0, 0.5)),
         (5, struct.pack("<ff", 3.0, 4.0) + bytes([0b1010] + [0] * 63), (3.0, 4.0)),
     ],
 )
 def test_inactive_values_of_a_compressed_leaf(code, extra, inactive):
-    """The six ways in which OpenVDB leaves out inactive values; voxels 1 and 3 are chosen, voxel 2 is active."""
+    """The six ways in which OpenVDB leaves out inactive values; voxels 1 and 3 are chosen, voxel 2 is active.
+
+    Of background and minus it the chosen ones are the background (test_level_sets.py has a file that OpenVDB wrote)."""
     data = bytes([code]) + extra + struct.pack("<f", 9.0)
     tree = Tree.__new__(Tree)
     tree.r, tree.flags, tree.half, tree.background = Reader(data, "x.vdb"), 2, False, 0.5

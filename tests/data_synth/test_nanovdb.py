@@ -1,0 +1,110 @@
+"""NanoVDB files, written by NanoVDB's own library (10.0.1): what they hold is what was put in, damage is one sentence."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_synth import InputError, RenderWarning, level_sets
+from data_synth.bricks import Sparse
+from data_synth.vdb import grid_names, read_level_set, read_vdb
+from data_synth.volumes import open_volume, read_volume
+
+FILES = Path(__file__).parent / "files"
+SEVERAL = FILES / "several.nvdb"
+"""density and Cd, spacing 0.5 from (1, -2, 3); ball4, ball8, ball16, the ball of ball.vdb in 4, 8 and 16 bits."""
+N = np.arange(300)
+VOXELS = np.stack([N * 37 % 61 - 30, N * 53 % 47 - 60, N * 29 % 300 - 140], axis=1)
+VALUES = np.float32(0.01) * (N + 1).astype(np.float32)
+
+
+def test_every_voxel_of_a_fog_is_what_was_put_in():
+    """Far apart and on both sides of 0, in several nodes of each level; vectors beside numbers."""
+    grid, colour = read_vdb(SEVERAL), read_vdb(SEVERAL, "Cd")
+    assert grid.name == "density" and grid.voxel_size == pytest.approx([0.5] * 3) and grid.origin.tolist() == [1, -2, 3]
+    assert np.array_equal(grid.values[tuple((VOXELS - grid.first).T)], VALUES) and (grid.values != 0).sum() == 300
+    want = np.stack([VALUES, np.float32(0.5) * VALUES, np.ones_like(VALUES)], axis=1)
+    assert np.array_equal(colour.values[tuple((VOXELS - colour.first).T)], want)
+    assert grid_names(SEVERAL)[0] == {"density": 1, "Cd": 3, "ball4": 1, "ball8": 1, "ball16": 1}
+    with pytest.warns(RenderWarning, match="took density as density, Cd as colour, not ball4"):
+        volume = open_volume(SEVERAL)
+    assert isinstance(volume.density, Sparse) and np.array_equal(volume.density.dense(), grid.values)
+    assert volume.colour is not None
+    assert np.array_equal(read_volume(f"{SEVERAL}:density")[0], grid.values)
+
+
+@pytest.mark.parametrize("name", ["ball.nvdb", "ball_blosc.nvdb"])
+def test_a_level_set_is_that_of_openvdb(name):
+    """Zip and blosc: sample by sample, what nanovdb made is what openvdb made of the same sphere."""
+    tree, voxel_size, origin = read_level_set(FILES / name)
+    other, _, _ = read_level_set(FILES / "ball.vdb")
+    assert voxel_size == pytest.approx([0.2] * 3) and origin.tolist() == [0, 0, 0]
+    assert tree.background == other.background and len(tree.leaves) == len(other.leaves) > 20
+    known = {tuple(place): k for k, place in enumerate(other.leaves)}
+    order = [known[tuple(place)] for place in tree.leaves]
+    assert np.array_equal(tree.values, other.values[order]) and np.array_equal(tree.active, other.active[order])
+    inside = [{(*place, edge) for places, edge, _ in t.inside for place in places.tolist()} for t in (tree, other)]
+    assert inside[0] == inside[1] and len(inside[0]) > 0
+
+
+@pytest.mark.parametrize("bits", [4, 8, 16])
+def test_quantised_samples_are_within_half_a_step(bits):
+    """A leaf's samples lie between its least and its largest, in 2^bits - 1 equal steps."""
+    tree, (other, _, _) = read_level_set(SEVERAL, f"ball{bits}")[0], read_level_set(FILES / "ball.vdb")
+    known = {tuple(place): k for k, place in enumerate(other.leaves)}
+    for place, values in zip(tree.leaves, tree.values, strict=True):
+        want = other.values[known[tuple(place)]]
+        assert abs(values - want).max() <= 0.5 * np.ptp(want) / (2**bits - 1) * (1 + 1e-3) + 1e-6
+    solid, exact = level_sets.level_set(0, SEVERAL, f"ball{bits}"), level_sets.level_set(0, FILES / "ball.vdb")
+    assert solid.bricks == exact.bricks
+
+
+def changed(name, at, kind, *values):
+    data = bytearray((FILES / name).read_bytes())
+    struct.pack_into("<" + kind, data, at, *values)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("data, message", [
+    (b"", "holds no float grid"), (b"PK\3\4" + bytes(40), "another format's"), (b"NanoVDB0", "ends too early"),
+    (changed("ball.nvdb", 8, "I", 29 << 21), "layout is version 29, not 32"),
+    (changed("ball.nvdb", 14, "H", 3), "codec is number 3"),
+    (changed("ball.nvdb", 16, "Q", 1 << 40), "says it has 1099511627776 bytes"),
+    (changed("ball.nvdb", 16 + 32, "I", 9), r"no float grid and ball \(half\) of other kinds"),
+    ((FILES / "ball.nvdb").read_bytes()[:3000], "ends too early"),
+    (changed("ball.nvdb", 16 + 176 + 5 + 8 + 500, "Q", 77), "compressed data are damaged"),
+])  # fmt: skip
+def test_damage_is_one_sentence(tmp_path, data, message):
+    (tmp_path / "b.nvdb").write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        read_volume(tmp_path / "b.nvdb")
+    assert "b.nvdb" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_damaged_trees_never_escape(tmp_path):
+    """Uncompressed, so that counts, offsets and masks themselves are hit, and children that point anywhere."""
+    import zlib
+
+    packed = (FILES / "ball.nvdb").read_bytes()
+    start = 16 + 176 + 5
+    plain = zlib.decompress(packed[start + 8 :])
+    head = bytearray(packed[:start])
+    struct.pack_into("<H", head, 14, 0)
+    struct.pack_into("<Q", head, 24, len(plain))
+    (tmp_path / "a.nvdb").write_bytes(head + plain)
+    assert np.array_equal(read_level_set(tmp_path / "a.nvdb")[0].values, read_level_set(FILES / "ball.nvdb")[0].values)
+    rng = np.random.default_rng(0)
+    for k in range(60):
+        damaged = bytearray(plain)
+        upper = 672 + 64 + 64 + 32  # behind the grid's head, the tree's and the root's
+        at = rng.integers(
+            *((280, upper), (upper, upper + 8256), (upper + 8256, upper + 270400))[k % 3], size=1 + 400 * (k % 3 == 2)
+        )
+        for place in at:
+            damaged[place] = int(rng.integers(0, 256))
+        (tmp_path / "b.nvdb").write_bytes(head + damaged)
+        try:
+            level_sets.level_set(0, tmp_path / "b.nvdb")
+        except InputError as error:
+            assert "b.nvdb" in str(error) and "\n" not in str(error)
