@@ -14,6 +14,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "coverage": (0, 1), "erosion": (0, 0.99), "seed": (0, 2**31 - 1), "height": (1e-9, 1e9), "sigma": (0, 1e9),
     "radius": (1e-9, 1e9), "roughness": (0.01, 1), "thickness": (0, 1e6), "heat": (0, 1e6),
     "kelvin": (300, 40_000), "scale": (0.1, 64), "g": (-0.9999, 0.9999), "rain": (0, 1), "bars": (1, 64), "detail": (0, 8),
+    "threads": (2, 256), "leaves": (1, 64), "thinning": (0, 1e6),
 }  # fmt: skip
 """Of the parameters of scenes, by name."""
 

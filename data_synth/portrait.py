@@ -52,6 +52,19 @@ def framed(camera: Camera, alpha: np.ndarray) -> Camera:
     return replace(camera, c2w=c2w, focal=float(focal))
 
 
+def _frame(camera: Camera, glance: Callable[[Camera], Picture]) -> Camera:
+    """``camera`` framed by a glance at twice its field, so that what it cuts off is seen whole; what goes on beyond that has
+    no edges to be framed by and is framed as the camera sees it."""
+    wide = replace(camera, focal=0.5 * camera.focal)
+    small = max(128 / max(camera.width, camera.height), 1 / min(camera.width, camera.height))
+    size = [max(int(n * small), 1) for n in (camera.width, camera.height)]
+    alpha = glance(replace(wide, width=size[0], height=size[1], focal=wide.focal * small)).alpha
+    if max(edge.max() for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1])) < 0.5:
+        return framed(wide, alpha) if alpha.max() > 0.0 else camera
+    rows, columns = (slice(n // 4, max(n - n // 4, 1)) for n in alpha.shape)
+    return framed(camera, alpha[rows, columns])
+
+
 def denoised(picture: Picture) -> Picture:
     """The picture without its noise, by Intel's Open Image Denoise: it looks right and is no truth any more.
 
@@ -84,14 +97,7 @@ def portrait(
 
     preview: a quicker way to see the alpha, for framing.
     """
-    small = max(64 / max(camera.width, camera.height), 1 / min(camera.width, camera.height))
-    glance = replace(
-        camera,
-        width=max(int(camera.width * small), 1),
-        height=max(int(camera.height * small), 1),
-        focal=camera.focal * small,
-    )
-    picture = render(framed(camera, (preview or render)(glance).alpha))
+    picture = render(_frame(camera, preview or render))
     if denoise:
         picture = denoised(picture)
     shown = film((exposure_for(picture) if exposure is None else exposure) * picture.rgb)

@@ -1,55 +1,67 @@
 """Makes the pictures of docs/gallery.md again: ``python tools/gallery.py [NAME ...] [--volumes DIR] [--out DIR]``.
 
-Every picture is a command line of ``nerfvol synth``, printed before it runs. Those of real volumes (smoke.vdb, stent.npz) want
-the folder that holds them.
+The page itself is the list: below each heading stands the command that made the picture, and that is what runs here. Those of
+real volumes (smoke.vdb, stent.npz) want the folder that holds them.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
+import shlex
 import sys
+import time
 from pathlib import Path
 
 from data_synth.cli import main as synth
 
 ROOT = Path(__file__).resolve().parent.parent
-TRACED = "--integrator path --spp 16 --denoise --size"
-PICTURES = {
-    "cloud": f"cloud {TRACED} 480x360",
-    "cumulonimbus": f"cumulonimbus {TRACED} 360x360",
-    "stratus": f"stratus {TRACED} 640x400",
-    "cloudscape": "cloudscape --set detail=0 --set resolution=400 --integrator path --spp 48 --denoise --size 480x300",
-    "explosion": f"explosion {TRACED} 360x360",
-    "phantom": f"phantom {TRACED} 480x480",
-    "smoke": f"smoke {TRACED} 480x480",
-    "stent": f"phantom --volume {{volumes}}/stent.npz {TRACED} 360x360",
-    "real_smoke": f"smoke --volume {{volumes}}/smoke.vdb {TRACED} 480x480",
-    "fog": "fog --side 3 --size 640x480",
-    "mist": f"mist {TRACED} 640x480",
-    "solids": f"solids {TRACED} 640x480",
-    "cloth": f"cloth {TRACED} 480x480",
-    "leaf": f"leaf {TRACED} 480x360",
-    "showcase": "showcase --size 480x480",
-}
+PAGE = ROOT / "docs" / "gallery.md"
+
+
+def commands(page: str) -> list[list[str]]:
+    """The words after ``nerfvol synth`` of every command of the page, from top to bottom."""
+    return [shlex.split(line) for line in re.findall(r"^    nerfvol synth (.+)$", page, re.M)]
+
+
+def option(words: list[str], name: str) -> str | None:
+    """What follows an option of a command, None where it is not there."""
+    return words[words.index(name) + 1] if name in words else None
+
+
+def pictures(page: str) -> dict[str, list[str]]:
+    """The commands that write a picture which the page shows, by its name."""
+    shown = set(re.findall(r"\]\(gallery/(\w+)\.jpg\)", page))
+    made = {str(option(words, "--picture")).removesuffix(".jpg"): words for words in commands(page)}
+    return {name: words for name, words in made.items() if name in shown}
 
 
 def main(argv: list[str]) -> int:
+    listed = pictures(PAGE.read_text())
     p = argparse.ArgumentParser(description=__doc__)
-    p.add_argument("names", nargs="*", help=f"of {', '.join(PICTURES)}; all if none")
+    p.add_argument("names", nargs="*", help=f"of {', '.join(listed)}; all if none")
     p.add_argument("--volumes", type=Path, help="folder of real volumes; without it their pictures are left out")
-    p.add_argument("--out", type=Path, default=ROOT / "docs" / "gallery")
+    p.add_argument("--out", type=Path, default=PAGE.parent / "gallery")
+    p.add_argument("--smaller", type=int, default=1, metavar="N", help="drafts with 1/N of the width and of the height")
     args = p.parse_args(argv)
-    for name in args.names or PICTURES:
-        line = PICTURES.get(name)
-        if line is None:
-            p.error(f"expected one of {', '.join(PICTURES)}, got {name}")
-        if "{volumes}" in line and args.volumes is None:
-            print(f"{name}: left out, it wants --volumes")
-            continue
-        words = [*line.format(volumes=args.volumes).split(), "--picture", str(args.out / f"{name}.jpg")]
-        print("nerfvol synth", *words, flush=True)
+    for name in args.names or listed:
+        if name not in listed:
+            p.error(f"expected one of {', '.join(listed)}, got {name}")
+        words = list(listed[name])
+        words[words.index("--picture") + 1] = str(args.out / f"{name}.jpg")
+        volume = option(words, "--volume")
+        if volume is not None:
+            if args.volumes is None:
+                print(f"{name}: left out, it wants --volumes")
+                continue
+            words[words.index("--volume") + 1] = str(args.volumes / volume)
+        size = [int(n) // args.smaller for n in str(option(words, "--size")).split("x")]
+        words[words.index("--size") + 1] = "x".join(map(str, size))
+        print("nerfvol synth", shlex.join(words), flush=True)
+        started = time.process_time()
         if code := synth(words):
             return code
+        print(f"{name}: {time.process_time() - started:.0f} CPU s")
     return 0
 
 

@@ -12,9 +12,10 @@ import numpy as np
 from data_synth import checks, lights
 from data_synth.errors import InputError
 from data_synth.scene import Scene
+from data_synth.scenes.flakes import cloth, leaf
 from data_synth.scenes.landscape import cloudscape
 from data_synth.scenes.showcase import Showcase
-from data_synth.scenes.simple import cloth, fog, leaf, mist, slab, solids, sphere
+from data_synth.scenes.simple import fog, mist, slab, solids, sphere
 from data_synth.scenes.volumes import cloud, cumulonimbus, explosion, phantom, smoke, stratus
 
 SCENES: Mapping[str, Callable[..., Showcase | Scene]] = {"showcase": Showcase} | {

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from data_synth import lights, materials, media, phase, spongecake, surfaces
-from data_synth import sggx as flakes
+from data_synth import lights, materials, media, phase, surfaces
 from data_synth.cameras import Viewpoints
 from data_synth.scene import Scene
 
@@ -102,9 +101,16 @@ def _gem(material: int, centre: ArrayLike, radius: float) -> np.ndarray:
     return surfaces.mesh(material, v + np.asarray(centre), f)
 
 
-def fog(density: float = 0.38, g: float = 0.35) -> Scene:
-    """fog with shafts of light that fall through a slotted wall onto a checker floor"""
-    medium = media.homogeneous((-2, -2, -1), (2, 2, 0.5), density, 0.97, phase=phase.henyey_greenstein(g))
+def fog(density: float = 0.38, g: float = 0.35, thinning: float = 0.0) -> Scene:
+    """fog with shafts of light that fall through a slotted wall onto a checker floor
+
+    thinning: e-fold per u of height; 0 is fog that is the same everywhere, up to a height of 1.5 u.
+    """
+    scatter, lo, top = phase.henyey_greenstein(g), (-2, -2, -1), 0.5 if thinning <= 0 else 1.65
+    if thinning > 0:
+        medium = media.exponential(lo, (2, 2, top), 1.0 / thinning, density, 0.97, phase=scatter)
+    else:
+        medium = media.homogeneous(lo, (2, 2, top), density, 0.97, phase=scatter)
     wall = [surfaces.box(1, (-1.95, y, -1.0), (-1.85, y + 0.62, 1.65)) for y in (-2.0, -1.127, -0.253, 0.62, 1.38)]
     return Scene(
         medium=medium._replace(step=0.015),
@@ -127,60 +133,4 @@ def fog(density: float = 0.38, g: float = 0.35) -> Scene:
         viewpoints=Viewpoints(target=(0, 0, -0.2), radius=5.8, elevation=(8, 40), fov=42),
         integrators=("march", "path", "deep"),
         aabb=np.array([[-2.05, -2.05, -1.15], [2.05, 2.05, 1.65]]),
-    )
-
-
-def cloth(roughness: float = 0.25, density: float = 60.0, resolution: int = 192) -> Scene:
-    """a woven cloth of SGGX fibres: warp and weft are two directions of microflakes"""
-    lo, hi = np.array([-1.2, -1.2, -0.35]), np.array([1.2, 1.2, 0.35])
-    n = resolution
-    shape = (n, n, max(int(n * 0.7 / 2.4) + 1, 16))
-    x, y, z = np.meshgrid(*[np.linspace(lo[k], hi[k], shape[k]) for k in range(3)], indexing="ij", sparse=True)
-    pitch, thick = 0.15, 0.05
-    wave = 0.14 * np.sin(2.1 * x + 0.4) * np.cos(1.7 * y)  # the cloth hangs in folds
-    over = np.sin(np.pi * x / pitch) * np.sin(np.pi * y / pitch)
-    to_warp = ((np.mod(y, pitch) - pitch / 2) / (0.46 * pitch)) ** 2 + ((z - wave - 0.03 * over) / thick) ** 2
-    to_weft = ((np.mod(x, pitch) - pitch / 2) / (0.46 * pitch)) ** 2 + ((z - wave + 0.03 * over) / thick) ** 2
-    density_grid = density * np.clip(1.6 * (1.0 - np.minimum(to_warp, to_weft)), 0, 1)
-    attribute = np.where(to_warp < to_weft, 0.0, 1.0) + 0.0 * density_grid
-    flake = phase.microflakes(flakes.fibre((1, 0, 0), roughness), flakes.fibre((0, 1, 0), roughness))
-    medium = media.grid(
-        density_grid, lo, hi, 1.0, [(0.92, 0.28, 0.22), (0.93, 0.80, 0.48)], phase=flake, attribute=attribute
-    )
-    return Scene(
-        medium=medium,
-        lights=[lights.directional((0.6, -0.5, 1.0), 5.0), lights.sky((0.5, 0.6, 0.9), 0.8, 0.3)],
-        viewpoints=Viewpoints(radius=4.2, elevation=(25, 75)),
-        integrators=("path", "deep", "march"),
-        aabb=np.array([lo, hi]),
-    )
-
-
-def leaf(thickness: float = 1.4) -> Scene:
-    """a layered leaf: SpongeCake of a waxy skin over green flesh, lit from both sides"""
-    rows, faces = [], []
-    n, m = 48, 16
-    for i in range(n + 1):
-        s = i / n
-        half = 0.55 * np.sin(np.pi * s**0.8) ** 0.9 * (1 - 0.25 * s)
-        for j in range(m + 1):
-            t = 2.0 * j / m - 1.0
-            x = -1.2 + 2.4 * s
-            z = 0.25 * np.sin(1.9 * s) - 0.35 * s * s + 0.20 * abs(t) * half - 0.008 * np.cos(50 * s)
-            rows.append((x, half * t, z))
-    for i in range(n):
-        for j in range(m):
-            a = i * (m + 1) + j
-            faces += [[a, a + m + 1, a + 1], [a + 1, a + m + 1, a + m + 2]]
-    skin = spongecake.layer(0.10, flakes.surface((0, 0, 1), 0.25), (0.9, 0.95, 0.85))
-    flesh = spongecake.layer(thickness, flakes.surface((0, 0, 1), 0.75), (0.30, 0.78, 0.08))
-    vein = spongecake.layer(0.3, flakes.fibre((1, 0, 0), 0.3), (0.45, 0.85, 0.15))
-    return Scene(
-        triangles=surfaces.mesh(0, np.array(rows), np.array(faces)),
-        materials=[materials.layered(0, 3)],
-        layers=[skin, vein, flesh],
-        lights=[lights.directional((0.3, -0.5, 1.0), 4.5), lights.sky((0.5, 0.65, 1.0), 0.8, 0.35)],
-        viewpoints=Viewpoints(radius=3.6, elevation=(15, 70)),
-        integrators=("path", "march"),
-        aabb=np.array([[-1.3, -0.7, -0.7], [1.3, 0.7, 0.7]]),
     )

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from data_synth import InputError, Path, Viewpoints, cli, lights, media, scenes
+from data_synth import InputError, Path, Viewpoints, cli, lights, materials, media, scenes, surfaces
 from data_synth.cli import main
 from data_synth.image import Picture
 from data_synth.portrait import MARGIN, denoised, exposure_for, film, framed, portrait
@@ -126,3 +126,29 @@ def test_a_portrait_is_seen_from_where_one_says(monkeypatch, tmp_path, capsys):
         assert "--from: expected azimuth and elevation" in capsys.readouterr().err
     assert main(["slab", "--out", str(tmp_path / "d"), "--from", "20,40"]) == 2
     assert "--from: expected --picture" in capsys.readouterr().err
+
+
+def last_camera(scene, camera):
+    """The camera of the portrait itself, after the glance."""
+    views = []
+    portrait(lambda view: (views.append(view), Path(spp=4).render(scene, view, seed=1))[1], camera)
+    return views[-1]
+
+
+def test_what_the_camera_cuts_off_is_framed_whole():
+    scene = ball((0, 0, 0), 0.9)
+    camera = Viewpoints(radius=6.0, fov=16.0).camera(-55, 20, 48, 48)
+    assert Path(spp=4).render(scene, camera).alpha[:, 0].max() > 0.9
+    alpha = Path(spp=4).render(scene, last_camera(scene, camera)).alpha
+    assert max(edge.max() for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1])) == 0.0 < alpha.max()
+
+
+def test_what_has_no_edges_is_framed_as_the_camera_sees_it():
+    floor = Scene(
+        shapes=[surfaces.plane(0, (0, 0, -1), (0, 0, 1))],
+        materials=[materials.lambert(0.5)],
+        lights=[lights.environment(1.0)],
+    )
+    camera = Viewpoints(radius=4.0, fov=30.0).camera(-55, 70, 32, 32)
+    found, wanted = last_camera(floor, camera), framed(camera, np.ones((8, 8)))
+    assert found.focal == pytest.approx(wanted.focal) and np.allclose(found.c2w, wanted.c2w)
