@@ -112,7 +112,9 @@ class Tree:
         """The n values of a node and its active mask, undoing active-mask compression."""
         r = self.r
         code = r.number("b")
-        low = -self.background if code in (MINUS, MASK_NONE) else self.background  # of inactive values that are not chosen
+        low = (
+            -self.background if code in (MINUS, MASK_NONE) else self.background
+        )  # of inactive values that are not chosen
         high = self.background
         if code in (ONE_INACTIVE, MASK_ONE, MASK_TWO):
             low = self._value()
