@@ -12,6 +12,7 @@ from data_synth.errors import InputError
 from data_synth.image import Picture, linear_to_srgb
 
 MARGIN = 0.08  # of the picture's side, left free around what is in it
+WIDER = 3  # how much wider than the camera a glance is
 STRAY = 0.005  # of all alpha: so much of it may lie beyond each edge of what counts, single specks for example
 WHITE = 0.98  # part of the opaque pixels that stays below the film's shoulder
 
@@ -53,15 +54,17 @@ def framed(camera: Camera, alpha: np.ndarray) -> Camera:
 
 
 def _frame(camera: Camera, glance: Callable[[Camera], Picture]) -> Camera:
-    """``camera`` framed by a glance at twice its field, so that what it cuts off is seen whole; what goes on beyond that has
-    no edges to be framed by and is framed as the camera sees it."""
-    wide = replace(camera, focal=0.5 * camera.focal)
-    small = max(128 / max(camera.width, camera.height), 1 / min(camera.width, camera.height))
+    """``camera`` framed by a glance at three times its field, so that what it cuts off is seen whole.
+
+    What goes on beyond that has no edges to be framed by: it is framed as the camera sees it.
+    """
+    wide = replace(camera, focal=camera.focal / WIDER)
+    small = max(160 / max(camera.width, camera.height), 1 / min(camera.width, camera.height))
     size = [max(int(n * small), 1) for n in (camera.width, camera.height)]
     alpha = glance(replace(wide, width=size[0], height=size[1], focal=wide.focal * small)).alpha
     if max(edge.max() for edge in (alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1])) < 0.5:
         return framed(wide, alpha) if alpha.max() > 0.0 else camera
-    rows, columns = (slice(n // 4, max(n - n // 4, 1)) for n in alpha.shape)
+    rows, columns = (slice(n // WIDER, max(n - n // WIDER, 1)) for n in alpha.shape)
     return framed(camera, alpha[rows, columns])
 
 

@@ -61,10 +61,10 @@ def compare(found: np.ndarray, truth: np.ndarray, weight: np.ndarray | float = 1
     """Relative L1, Pearson's correlation, sums, and the middle one of the ratios."""
     constant = np.ptp(truth) <= 1e-9
     correlation = "none: the true one is constant" if constant else f"{np.corrcoef(found, truth)[0, 1]:.3f}"
-    total = (weight * truth).sum()
+    total, there = (weight * truth).sum(), truth > 0
     return (
         f"relative L1 {(weight * np.abs(found - truth)).sum() / total:.3f}, correlation {correlation}, "
-        f"found/true {(weight * found).sum() / total:.3f}, median {np.median(found / truth):.3f} ({len(truth)})"
+        f"found/true {(weight * found).sum() / total:.3f}, median {np.median(found[there] / truth[there]):.3f} ({len(truth)})"
     )
 
 
