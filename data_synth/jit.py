@@ -26,6 +26,8 @@ from data_synth.errors import InputError
 try:
     import numba
     from numba.core import event
+
+    from data_synth.linking import Compiler, InnerCompiler
 except ImportError as error:
     raise InputError(f"simulated scenes are compiled by numba ({error}): pip install 'nerfvol[synth]'") from error
 
@@ -36,9 +38,9 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 # No wrappers: compiled code alone calls these functions, and wrapping each of them for Python took a third of the time that
 # compiling takes. To call one from Python say function.py_func(...).
 INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-jit = numba.njit(**INNER)
+jit = numba.njit(pipeline_class=InnerCompiler, **INNER)
 # For what is called at every step: a call that is not inlined hands over every number and array of a medium, one by one.
-inlined = numba.njit(forceinline=True, **INNER)
+inlined = numba.njit(pipeline_class=InnerCompiler, forceinline=True, **INNER)
 
 
 def plain(function: Callable) -> Callable:
@@ -74,7 +76,7 @@ def kernel(function: Callable) -> Callable:
     Numba itself compares only the file the function stands in, and would go on using code into which it has inlined
     a function of another, since edited file.
     """
-    compiled = numba.njit(cache=True, **OPTIONS)(function)
+    compiled = numba.njit(cache=True, pipeline_class=Compiler, **OPTIONS)(function)
     index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if index is not None and hasattr(index, "_source_stamp"):
         index._source_stamp = _stamp(function.__code__.co_filename)

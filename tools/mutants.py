@@ -39,10 +39,11 @@ M = Mutant
 PEOPLE, MASKS, FAULTS = "datasets/test_whatever_people_bring.py", "datasets/test_masks.py", "training/test_faults.py"
 PROGRAMS, PLAIN = "datasets/test_other_programs.py", "data_synth/test_plain.py"
 ROUGH, CORE = "data_synth/test_rough.py", "data_synth/test_compiled.py"
-SCANS, FLAKES, FIELDS, CLOUDS, TOGETHER = (
+SCANS, FLAKES, FIELDS, CLOUDS, TOGETHER, RECOVERED = (
     f"data_synth/test_plain.py::test_in_plain_python[plain_{name}.py]"
-    for name in ("scans", "flakes", "fields", "clouds", "combined")
+    for name in ("scans", "flakes", "fields", "clouds", "combined", "recovered")
 )
+STRATUS = "data_synth/test_noise_clouds.py::test_a_layer_of_stratus_has_tiles_by_scale_and_holes_by_erosion"
 CARVED = "data_synth/test_noise_clouds.py::test_the_clouds_of_a_landscape_are_carved_and_end_before_the_box_does"
 TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.py"
 SETS, EXPOSURES, POSE_MASKS = "datasets/test_dataset.py", "starts/test_exposures.py", "poses/test_masks.py"
@@ -399,6 +400,18 @@ MUTANTS = (
     M("data_synth/detail.py", "return np.minimum(d.contrast * shape, 1.0)", "return shape", CLOUDS, "majorants know nothing of contrast"),
     M("data_synth/scenes/landscape.py", "RIM = 1.2 ", "RIM = 0.05 ", CARVED, "clouds too steep for their detail"),
     M("data_synth/transfer.py", "    except InputError:\n        raise\n", "", SCANS, "one sentence inside another"),
+    M("data_synth/scenes/volumes.py", "coverage, scale, erosion, seed)", "coverage, 1.6, erosion, seed)", STRATUS, "every layer has the same tiles"),
+    M("data_synth/scenes/volumes.py", "coverage, scale, erosion, seed)", "coverage, scale, 0.35, seed)", STRATUS, "every layer is as worn"),
+    M("data_synth/linking.py", "return list(reversed(left))", "return list(left)", "data_synth/test_jit.py", "code is linked before what asks for it"),
+    M("tools/recovered.py", "(weight * np.abs(found - truth)).sum() / total", "np.abs(found - truth).sum() / total", RECOVERED, "errors without their weights"),
+    M("tools/recovered.py", "{(weight * found).sum() / total", "{found.sum() / total", RECOVERED, "sums without their weights"),
+    M("tools/recovered.py", "compare(density, truth, seen(octree, points, eyes))", "compare(density, truth)", RECOVERED, "what no camera sees counts as seen"),
+    M("tools/recovered.py", "o = np.repeat(points, len(eyes), axis=0)", "o = np.tile(points, (len(eyes), 1))", RECOVERED, "points and cameras in another order"),
+    M("tools/recovered.py", "lookups.density(m, (x, y, z))", "lookups.density(m, (z, y, x))", RECOVERED, "x and z of the truth change places"),
+    M("tools/recovered.py", "m.sigma_t[1] * lookups.density", "lookups.density", RECOVERED, "density is taken for extinction"),
+    M("tools/recovered.py", "np.mean([sigma(*p) for p in along]) * length", "np.mean([sigma(*p) for p in along])", RECOVERED, "chords of one length"),
+    M("tools/recovered.py", "distance(x, y, z) > MARGIN", "distance(x, y, z) > 0.0", RECOVERED, "walls of the showcase count"),
+    M("tools/recovered.py", "for sign in (1, -1))]", "for sign in (1,))]", RECOVERED, "solids keep their distance on one side"),
 )  # fmt: skip
 
 

@@ -98,6 +98,21 @@ def test_other_lights_leave_a_scene_its_exposure():
     assert own.exposure == other.exposure != 1.0 and len(other.lights) == 1
 
 
+def test_a_layer_of_stratus_has_tiles_by_scale_and_holes_by_erosion(textures, monkeypatch):
+    """Two tiles along the layer repeat after half of it, detail and all; erosion takes away, never adds."""
+    monkeypatch.setattr(clouds, "cloud_textures", lambda seed: textures)
+
+    def layer(**parameters):
+        return media.dense(scenes.make("stratus", resolution=49, coverage=0.9, **parameters).medium)
+
+    flat = slice(6, 43)  # where the layer's edge is no nearer than 0.12 of its side
+    tiled, other = (layer(scale=scale)[:, flat] for scale in (2.0, 1.6))
+    assert np.allclose(tiled[6:19], tiled[30:43], atol=1e-5) and 0.1 < tiled[6:43].mean() < 0.9
+    assert np.abs(other[6:19] - other[30:43]).mean() > 0.01
+    bare, worn = layer(erosion=0.0), layer(erosion=0.7)
+    assert (worn <= bare + 1e-6).all() and 0.05 < worn.mean() < 0.95 * bare.mean()
+
+
 def test_the_clouds_of_a_landscape_are_carved_and_end_before_the_box_does():
     """Of what would be solid without erosion noise takes a third to most away; of a shape that is 1 just behind its rim it
     takes hardly any."""
