@@ -24,6 +24,7 @@ from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.dataset import evenly as even_places
 from nerfvol.datasets.frame import Frame
+from nerfvol.datasets.images import map_threads
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.machine import process_seconds
@@ -138,9 +139,10 @@ def octree_of(
         InputError: no splat lies in the scene's region, or none is seen.
     """
     level = finest_level(scene, cameras) if level is None else level
-    views, images = looked_at(SplatModel(splats), small_cameras(cameras, scene), background)
+    fitted = [_without_lens(camera) for camera in small_cameras(cameras, scene)]
+    views, images = looked_at(SplatModel(splats), fitted, background)
     octree = _with_surfaces(octree_around(splats, scene, cameras, level), views)
-    seen = _dataset([view.camera for view in views], images, scene, SplatModel.kind)
+    seen = _dataset(fitted, images, scene, SplatModel.kind)
     trainer = OctreeTrainer(seen, background, OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT), seed, octree)
     for step in range(FITTED_STEPS):
         trainer.step(step / FITTED_STEPS)
@@ -165,8 +167,8 @@ def surfaces_of(
 
 
 def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:
-    """Of splats as they stand, what LOOKS of ``views`` tell; without the leaves that are empty then."""
-    write_surfaces(octree, evenly(views, LOOKS))
+    """Of splats as they stand, what ``views`` tell; without the leaves that are empty then."""
+    write_surfaces(octree, views)
     solid = thickness(octree) >= EMPTY
     return octree.prune(solid)[0] if solid.any() else octree
 
@@ -174,18 +176,28 @@ def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:
 def looked_at(
     model: Model, cameras: Sequence[Camera], background: Sequence[float]
 ) -> tuple[list[Seen], list[NDArray[np.uint8]]]:
-    """What ``cameras`` see of a model, with distances, as pinholes; and the same as pictures over ``background``."""
-    views, images = [], []
-    for given in cameras:
-        lens = given.intrinsics
-        camera = given.through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
-        image = model.render(camera, background, ("rgb", "opacity", "median_depth"))
+    """What LOOKS of ``cameras`` see of a model, with distances, as pinholes; and what all of them see over ``background``."""
+    looks = set(evenly(range(len(cameras)), LOOKS))
+
+    def look(i: int) -> tuple[Seen | None, NDArray[np.uint8]]:
+        camera = _without_lens(cameras[i])
+        outputs = ("rgb", "opacity", "median_depth") if i in looks else ("rgb",)
+        image = model.render(camera, background, outputs)
+        if i not in looks:
+            return None, _bytes_of(image["rgb"])
         opacity = image["opacity"]
         through = (1 - opacity)[..., None] * np.asarray(background, np.float32)
         rgb = (image["rgb"] - through) / np.maximum(opacity, 1 / 255)[..., None]
-        views.append(Seen(camera, rgb, opacity, image["median_depth"]))
-        images.append(_bytes_of(image["rgb"]))
-    return views, images
+        return Seen(camera, rgb, opacity, image["median_depth"]), _bytes_of(image["rgb"])
+
+    # One picture is drawn while another is worked over.
+    made = map_threads(look, range(len(cameras)), 2)
+    return [seen for seen, _ in made if seen is not None], [image for _, image in made]
+
+
+def _without_lens(camera: Camera) -> Camera:
+    lens = camera.intrinsics
+    return camera.through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
 
 
 def octree_of_field(

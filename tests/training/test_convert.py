@@ -160,11 +160,19 @@ def test_what_is_looked_at_are_the_pictures_of_the_fit(converted):
         opacity = view.opacity[..., None]
         again = 255 * (view.rgb * opacity + (1 - opacity) * np.array(WHITE))
         assert np.abs(again - image).max() < 0.5 + 1
-    assert [len(convert.evenly(range(n), 5)) for n in (3, 5, 9)] == [3, 5, 5] and convert.evenly(range(9), 3) == [
-        0,
-        4,
-        8,
+    assert [len(convert.evenly(range(n), 5)) for n in (3, 5, 9)] == [3, 5, 5]
+    assert convert.evenly(range(9), 3) == [0, 4, 8]
+
+
+def test_few_pictures_are_looks_and_all_are_fitted_to(converted, monkeypatch):
+    discs, seen, _ = converted
+    monkeypatch.setattr(convert, "LOOKS", 3)
+    views, images = convert.looked_at(discs, seen.cameras, WHITE)
+    assert [view.camera.position.tolist() for view in views] == [
+        camera.position.tolist() for camera in convert.evenly(seen.cameras, 3)
     ]
+    for image, taken in zip(images, seen.images, strict=True):
+        np.testing.assert_array_equal(image, taken)
 
 
 @pytest.mark.parametrize("is_unbounded", [False, True])

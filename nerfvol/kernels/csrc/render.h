@@ -56,8 +56,9 @@ struct Waiting {
     static constexpr int kCapacity = 2 * kTile;  // small, to stay in the core's nearest cache
     int first = 0, end = 0;
     int32_t lane[kCapacity];
-    f4 value[kCapacity];                   // r, g, b, distance
     float raw[kCapacity + 16], length[kCapacity + 16];  // read sixteen at a time, a few beyond the end
+    float middle[kCapacity], place[kCapacity][3];
+    Cell cell[kCapacity];
     float slope[kCapacity][3];             // of the raw density, for normals
 
     int size() const { return end - first; }
@@ -65,8 +66,8 @@ struct Waiting {
     // Makes room for a strip's hits behind those that wait.
     void make_room(bool with_slopes) {
         if (end + kTile <= kCapacity) return;
-        const auto forward = [&](auto* rows) { std::memmove(rows, rows + first, size() * sizeof(*rows)); };
-        forward(lane); forward(value); forward(raw); forward(length);
+        const auto forward = [&](auto* rows) { std::memmove(rows, rows + first, size_t(size()) * sizeof(*rows)); };
+        forward(lane); forward(raw); forward(length); forward(middle); forward(place); forward(cell);
         if (with_slopes) forward(slope);
         end -= first;
         first = 0;
@@ -75,7 +76,17 @@ struct Waiting {
 
 // What a packet's rays gather besides colour.
 template <int S> struct Extras {
-    float median[S * kTile] = {}, normal[S * kTile][3] = {};
+    float depth[S * kTile] = {}, median[S * kTile] = {}, normal[S * kTile][3] = {};
+};
+
+// Segments too faint to be seen have the colour of the next one on their ray, which is as good as theirs and saves most of
+// the work where rays cross haze: a weight below early_stop_eps / kFaint, and no more of it on a ray than early_stop_eps.
+constexpr float kFaint = 4;
+template <int S> struct Faint {
+    float owed[S * kTile] = {};            // weight without a colour so far
+    float spare[S * kTile];                // how much more may go that way
+
+    explicit Faint(float early_stop_eps) { std::fill_n(spare, S * kTile, early_stop_eps); }
 };
 
 inline void add_normal(const float* slope, float w, float* normal) {
@@ -92,28 +103,43 @@ inline float median_distance(float before, float raw, float length, float middle
 }
 
 // Composites the first `m` <= 64 of the hits that wait.
-template <int S>
+template <int B, int S>
 void composite(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, Waiting& waiting, int m,
-               PacketState<S>& state, Extras<S>& extras) {
+               const Harmonics<B>* basis, PacketState<S>& state, Faint<S>& faint, Extras<S>& extras) {
     Extinction x;
     x.evaluate(waiting.raw + waiting.first, waiting.length + waiting.first, m, tree.density_scale, false);
-    const bool with_median = out.median_depth, with_normal = out.normal;
+    const bool with_depth = out.depth, with_median = out.median_depth, with_normal = out.normal;
+    const float too_faint = options.early_stop_eps * (1 / kFaint);
     bool some_end = false;
+    int lit[kTile + 1], n_lit = 0;
+    float weight[kTile + 1];
     for (int i = 0, j = waiting.first; i < m; ++i, ++j) {
         const int l = waiting.lane[j];
         uint64_t& alive = p.strips[l / kTile].alive;
         if (!(alive >> l % kTile & 1)) continue;
         const float before = state.trans[l], after = before * x.through[i], w = before * x.alpha[i];
-        state.colour[l] += w * waiting.value[j];
         state.trans[l] = after;
+        const bool is_faint = (w < too_faint) & (w <= faint.spare[l]);
+        lit[n_lit] = j;
+        weight[n_lit] = w + faint.owed[l];
+        n_lit += !is_faint;
+        faint.owed[l] = is_faint ? faint.owed[l] + w : 0.0f;
+        faint.spare[l] -= is_faint ? w : 0.0f;
+        if (with_depth) extras.depth[l] += w * waiting.middle[j];
         if (with_median && before > 0.5f && after <= 0.5f)
-            extras.median[l] = median_distance(before, waiting.raw[j], waiting.length[j], waiting.value[j][3], tree.density_scale);
+            extras.median[l] = median_distance(before, waiting.raw[j], waiting.length[j], waiting.middle[j], tree.density_scale);
         if (with_normal) add_normal(waiting.slope[j], w, extras.normal[l]);
         if (after < options.early_stop_eps) {
             alive &= ~(1ull << l % kTile);
             some_end = true;
         }
     }
+    if (out.rgb)
+        for (int i = 0; i < n_lit; ++i) {
+            const int j = lit[i], l = waiting.lane[j];
+            const float* at = waiting.place[j];
+            state.colour[l] += weight[i] * (colour_at<B>(waiting.cell[j], at[0], at[1], at[2], basis[l / kTile].row[l % kTile]) + 0.5f);
+        }
     if (some_end) p.find_alive();
     waiting.first += m;
 }
@@ -140,7 +166,7 @@ void write_window(const Window& to, const PacketState<S>& state, const Extras<S>
         if (out.rgb)
             for (int k = 0; k < 3; ++k) out.rgb[3 * i + k] = state.colour[l][k] + t * options.background[k];
         if (out.trans) out.trans[i] = t;
-        if (out.depth) out.depth[i] = state.colour[l][3];
+        if (out.depth) out.depth[i] = extras.depth[l];
         if (out.median_depth) out.median_depth[i] = extras.median[l];
         if (out.normal) std::memcpy(out.normal + 3 * i, extras.normal[l], sizeof(extras.normal[l]));
     }
@@ -148,35 +174,41 @@ void write_window(const Window& to, const PacketState<S>& state, const Extras<S>
 
 template <int B, int S>
 void render_packet(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, const Window& to) {
-    BasisRows<B> basis[S];
+    Harmonics<B> basis[S];
     bool has_basis[S] = {};                // many strips of a picture meet nothing
     PacketState<S> state;
     Waiting waiting;
+    Faint<S> faint(options.early_stop_eps);
     Extras<S> extras;
-    march<B>(tree, p, [&](const Leaf&, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
+    march<B>(tree, p, [&](const Leaf&, const uint64_t* hits, const Segments* segments, const Cell& cell) {
+        const DensityField density(cell.values, cell.corners, 16 * B);
         for (int s = 0; s < S; ++s) {
             if (!hits[s]) continue;
             const Segments& at = segments[s];
             if (!has_basis[s]) basis[s].fill(p.strips[s], tree.sh_degree);
             has_basis[s] = true;
             waiting.make_room(out.normal);
+            alignas(64) float raw[kTile];
+            for (int base = 0; base < kTile; base += 16)
+                if (hits[s] >> base & 0xffff)
+                    store(raw + base, density.at(load<f16>(at.fx + base), load<f16>(at.fy + base), load<f16>(at.fz + base)));
             int i = waiting.end;
             for (uint64_t h = hits[s]; h; h &= h - 1, ++i) {
                 const int l = __builtin_ctzll(h);
-                f4 value = field.at(at.fx[l], at.fy[l], at.fz[l], basis[s].row[l]);
                 waiting.lane[i] = s * kTile + l;
-                waiting.raw[i] = value[3];
-                value += 0.5f;
-                value[3] = at.middle[l] * tree.size;
-                waiting.value[i] = value;
+                waiting.raw[i] = raw[l];
                 waiting.length[i] = at.length[l] * tree.size;
-                if (out.normal) field.density_slope(at.fx[l], at.fy[l], at.fz[l], waiting.slope[i]);
+                waiting.middle[i] = at.middle[l] * tree.size;
+                waiting.place[i][0] = at.fx[l]; waiting.place[i][1] = at.fy[l]; waiting.place[i][2] = at.fz[l];
+                waiting.cell[i] = cell;
+                if (out.normal) density.slope(at.fx[l], at.fy[l], at.fz[l], waiting.slope[i]);
             }
             waiting.end = i;
-            if (waiting.size() >= 16) composite(tree, p, options, out, waiting, std::min(waiting.size() & ~15, kTile), state, extras);
+            if (waiting.size() >= 16)
+                composite(tree, p, options, out, waiting, std::min(waiting.size() & ~15, kTile), basis, state, faint, extras);
         }
     });
-    composite(tree, p, options, out, waiting, waiting.size(), state, extras);
+    composite(tree, p, options, out, waiting, waiting.size(), basis, state, faint, extras);
     write_window(to, state, extras, options, out);
 }
 

@@ -87,16 +87,68 @@ template <int B> struct LeafField {
         }
         return out;
     }
+};
+
+// The raw density of a leaf alone, as the same polynomial.
+struct DensityField {
+    float c[8];
+
+    DensityField(const RowNumber* values, const int32_t* corners, int row) {
+        for (int o = 0; o < 8; ++o) c[o] = values[row * int64_t(corners[o]) + kDensitySlot];
+        for (int axis = 1; axis < 8; axis *= 2)
+            for (int o = 0; o < 8; ++o)
+                if (o & axis) c[o] -= c[o ^ axis];
+    }
+
+    f16 at(const f16& x, const f16& y, const f16& z) const {
+        const f16 front = (c[0] + z * c[1]) + y * (c[2] + z * c[3]), back = (c[4] + z * c[5]) + y * (c[6] + z * c[7]);
+        return front + x * back;
+    }
 
     // d(raw density)/d(x, y, z) at a point.
-    void density_slope(float x, float y, float z, float* g) const {
-        float d[8];
-        for (int o = 0; o < 8; ++o) d[o] = quarter<kDensitySlot / 4>(c[o][0])[0];
-        g[0] = d[4] + z * d[5] + y * (d[6] + z * d[7]);
-        g[1] = d[2] + z * d[3] + x * (d[6] + z * d[7]);
-        g[2] = d[1] + y * d[3] + x * (d[5] + y * d[7]);
+    void slope(float x, float y, float z, float* g) const {
+        g[0] = c[4] + z * c[5] + y * (c[6] + z * c[7]);
+        g[1] = c[2] + z * c[3] + x * (c[6] + z * c[7]);
+        g[2] = c[1] + y * c[3] + x * (c[5] + y * c[7]);
     }
 };
+
+// Per ray: the basis, four numbers of each block together, as few as a picture's rays keep in the nearest cache.
+template <int B> struct Harmonics {
+    static constexpr int kRow = B == 2 ? 12 : 4 * B;
+    alignas(64) float row[kTile][kRow];
+
+    void fill(const Lanes& rays, int degree) {
+        for (int l = 0; l < kTile; ++l) {
+            float b[16] = {};
+            sh_basis(degree, rays.dx[l], rays.dy[l], rays.dz[l], b);
+            std::memcpy(row[l], b, sizeof(row[l]));
+        }
+    }
+};
+
+// (r, g, b, 0) of a cell at a point along a ray's basis, without the constant 1/2: eight weighted rows, for a cell is met by
+// two rays on average and a polynomial costs as much as three points.
+template <int B> f4 colour_at(const Cell& cell, float x, float y, float z, const float* basis) {
+    alignas(32) float w[8];
+    store(w, trilinear(x, y, z));
+    keep_in_memory(w);
+    f16 sum[B] = {};
+    for (int o = 0; o < 8; ++o)
+        for (int k = 0; k < B; ++k) {
+            f16 corner;
+            read_row(cell.values + 16 * (B * int64_t(cell.corners[o]) + k), corner);
+            sum[k] += w[o] * corner;
+        }
+    f16 terms{};
+    for (int k = 0; k < B; ++k) {
+        const f4 four = load<f4>(basis + 4 * k);
+        terms += sum[k] * join(four, four, four, f4{});
+    }
+    f4 out = quad_sums(terms);
+    if (B == 2) out += basis[8] * quarter<3>(sum[B - 1]);  // degree 2's ninth coefficients
+    return f4{out[0], out[1], out[2], 0.0f};
+}
 
 // sigma / density_scale: exponential below 1, linear above (value and slope are continuous).
 inline f16 explin(const f16& raw) { return select_less(raw, 1.0f, vexp(raw - 1.0f), raw); }
