@@ -85,7 +85,17 @@ def load_dataset(
     backdrop = evidence.backdrop if decision.kind == "object" and not evidence.see_through else None
     some = masks if any(mask is not None for mask in masks) else None
     return Dataset(
-        cameras, store, names, found.bounds, source, messages, threads, listing.read_points, some, backdrop, decision.kind
+        cameras,
+        store,
+        names,
+        found.bounds,
+        source,
+        messages,
+        threads,
+        listing.read_points,
+        some,
+        backdrop,
+        decision.kind,
     )
 
 

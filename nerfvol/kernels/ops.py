@@ -82,8 +82,8 @@ def render_rays(
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
     by less than that; 0 is exact. A node whose side is below ``coarse`` times the distance of its centre from the ray's
-    origin is drawn as one prefiltered cell (nerfvol.octree.lod); 0: none is. Raises ValueError where rays, background,
-    threshold, outputs or coarse are not what they should be.
+    origin is drawn as one prefiltered cell (nerfvol.octree.lod); 0: none is. Raises ValueError where rays, background, threshold, outputs or
+    coarse are not what they should be.
     """
     o, d = check_rays(rays_o, rays_d)
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
@@ -104,8 +104,12 @@ def render_view(
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
     coarse: float = 0.0,
+    small: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Renders a camera's picture; results as in :func:`render_rays`, (height, width[, 3]).
+
+    small: cells whose side is below so many times their distance have the spherical harmonics of the ray through their
+    middle for all rays; 0 (and the reference, always): none.
 
     Raises ValueError where the view is no float32 array of squares or not finite, and as render_rays does.
     """
@@ -126,7 +130,7 @@ def render_view(
         return {name: rows.reshape(height, width, *rows.shape[1:]) for name, rows in rays.items()}
     out = _empty_outputs(outputs, (height, width))
     tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32), coarse)
-    frame = (rotation.ravel().tolist(), origin.tolist(), height, width)
+    frame = (rotation.ravel().tolist(), origin.tolist(), height, width, float(small))
     compiled.render_view(tree, directions, *frame, bg, eps, *(out.get(name) for name in OUTPUTS))
     return _finished(out)
 

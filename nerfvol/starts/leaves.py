@@ -216,7 +216,11 @@ def _write(
     share[:, 0] = 1
     values = _at_vertices(octree, share, np.minimum(sums[:, 0], _THICKEST / octree.leaf_sizes()))
     total, count = values[:, 0], np.bincount(octree.corners.reshape(-1), minlength=octree.n_vertices)
-    octree.values[:, sh_slots(octree.sh_degree).reshape(-1)] = values[:, 1:] / np.maximum(total, 1e-12)[:, None]
+    slots = sh_slots(octree.sh_degree).reshape(-1)
+    columns = (
+        slice(slots[0], slots[-1] + 1) if len(slots) == 1 + slots[-1] - slots[0] else slots
+    )  # a copy, no scattering
+    octree.values[:, columns] = values[:, 1:] * (1 / np.maximum(total, 1e-12))[:, None]
     raw = explin_inverse(np.maximum(total / count / octree.density_scale, 1e-30))
     octree.values[:, DENSITY_SLOT] = np.maximum(raw, EMPTY_DENSITY)
     octree.prefiltered = None
@@ -248,8 +252,8 @@ def _weighed(
 
 
 def _add(rows: Float, of: NDArray[np.int64], weight: Float, to: NDArray[np.int64], sums: Float) -> None:
-    """Adds ``weight`` (m,) times the rows (any, width) numbered ``of`` (m,) to the rows ``to`` (m,) of ``sums`` (n, width); to none
-    where that is negative."""
+    """Adds ``weight`` (m,) times the rows (any, width) numbered ``of`` (m,) to the rows ``to`` (m,) of ``sums`` (n, width);
+    to none where that is negative."""
     compiled = native()
     if compiled is not None:
         compiled.add_rows(np.ascontiguousarray(rows), of, weight, to, sums)

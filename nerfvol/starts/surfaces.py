@@ -81,7 +81,7 @@ def write_surfaces(octree: Octree, views: Sequence[Seen]) -> None:
     raw = explin_inverse(np.maximum(thickness / side / octree.density_scale, 1e-30))
     values, chosen = octree.values, np.flatnonzero(surface)
     values[:, DENSITY_SLOT] = np.maximum(raw, EMPTY_DENSITY)
-    values[chosen[:, None, None], slots] = sh[chosen]
+    values[chosen[:, None], slots.reshape(-1)] = sh[chosen].reshape(-1, slots.size)
     octree.prefiltered = None
 
 

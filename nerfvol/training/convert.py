@@ -50,8 +50,10 @@ MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
 FITTED_VIEWS, FITTED_VIEWS_OF_OBJECTS = 100, 50
 """Pictures of the splats that their octree is fitted to, at most."""
-FITTED_STEPS = 144
-"""Steps of the fit, which begins with the surfaces found (starts/surfaces.py): some two seconds on two cores."""
+FITTED_STEPS = 100
+"""Steps of the fit, which begins with the surfaces found (starts/surfaces.py): some one and a half seconds on two cores."""
+LEVELLED = 0.03
+"""Share of the mean that its second moments begin with: worth 40 steps (docs/experiments.md)."""
 LOOKS = 32
 """Pictures that tell surfaces from the free before the fit."""
 EMPTY = 0.02
@@ -138,6 +140,10 @@ def octree_of(
     Raises:
         InputError: no splat lies in the scene's region, or none is seen.
     """
+    frame = Frame.of(scene)
+    if not frame.is_identity:  # float32 tells no rays of map coordinates apart
+        octree = octree_of(*_moved(frame, splats, scene, cameras), background, level, seed)
+        return frame.octree_back(octree)
     level = finest_level(scene, cameras) if level is None else level
     fitted = [_without_lens(camera) for camera in small_cameras(cameras, scene)]
     views, images = looked_at(SplatModel(splats), fitted, background)
@@ -146,6 +152,8 @@ def octree_of(
     trainer = OctreeTrainer(seen, background, OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT), seed, octree)
     for step in range(FITTED_STEPS):
         trainer.step(step / FITTED_STEPS)
+        if step == 0:
+            trainer.state.level_moments(LEVELLED)
     return trainer.octree
 
 
@@ -158,6 +166,9 @@ def surfaces_of(
     level: as in :func:`octree_of`, which raises the same; None: around photographs one finer, for what is nearer than the
     scene's middle has smaller pixels, and no leaf is finer than those that see it ask for, nor than ``most_level``.
     """
+    frame = Frame.of(scene)
+    if not frame.is_identity:
+        return frame.octree_back(surfaces_of(*_moved(frame, splats, scene, cameras), background, level, most_level))
     if level is None:
         level = min(finest_level(scene, cameras) + scene.is_unbounded, most_level)
     octree = octree_around(splats, scene, cameras, level)
@@ -166,11 +177,22 @@ def surfaces_of(
     )
 
 
+def _moved(
+    frame: Frame, splats: Splats, scene: SceneBounds, cameras: Sequence[Camera]
+) -> tuple[Splats, SceneBounds, list[Camera]]:
+    return frame.splats_into(splats), frame.scene_into(scene), [frame.camera_into(camera) for camera in cameras]
+
+
 def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:
-    """Of splats as they stand, what ``views`` tell; without the leaves that are empty then."""
+    """Of splats as they stand, what ``views`` tell; without the leaves that are empty then. InputError where all are."""
     write_surfaces(octree, views)
     solid = thickness(octree) >= EMPTY
-    return octree.prune(solid)[0] if solid.any() else octree
+    if not solid.any():
+        finest = octree.leaf_sizes().min()
+        raise InputError(
+            f"none of the splats is seen: they are transparent, or far smaller than the finest leaves ({finest:.3g})"
+        )
+    return octree.prune(solid)[0]
 
 
 def looked_at(
@@ -234,10 +256,12 @@ def tuned_octree(
 
     The budget counts from the start of the process; writing, and scoring ``scored`` views with both models, lie within it.
     """
+    frame = Frame.of(dataset.scene)
+    dataset, octree = frame.dataset_into(dataset), frame.octree_into(octree)
     settings = dataclasses.replace(config.octree.from_surfaces(dataset.scene), steps=FINE_STEPS)
     trainer = OctreeTrainer(dataset, background, settings, config.seed, octree)
     _run(trainer, dataset.cameras[0], config.time_budget, scored, say)
-    return trainer.finish()
+    return frame.octree_back(trainer.finish())
 
 
 def tuned_splats(

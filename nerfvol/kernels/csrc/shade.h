@@ -87,68 +87,59 @@ template <int B> struct LeafField {
         }
         return out;
     }
+
+    // d(raw density)/d(x, y, z) at a point.
+    void density_slope(float x, float y, float z, float* g) const {
+        float d[8];
+        for (int o = 0; o < 8; ++o) d[o] = quarter<kDensitySlot / 4>(c[o][0])[0];
+        g[0] = d[4] + z * d[5] + y * (d[6] + z * d[7]);
+        g[1] = d[2] + z * d[3] + x * (d[6] + z * d[7]);
+        g[2] = d[1] + y * d[3] + x * (d[5] + y * d[7]);
+    }
 };
 
-// The raw density of a leaf alone, as the same polynomial.
-struct DensityField {
-    float c[8];
+// The field of a cell that is small, seen from the rays' origin: its harmonics along the ray through its middle serve all rays
+// that meet it, so that only (r, g, b, raw density) is left to be interpolated; rgb without the constant 1/2.
+template <int B> struct SmallLeafField {
+    f4 c[8];
 
-    DensityField(const RowNumber* values, const int32_t* corners, int row) {
-        for (int o = 0; o < 8; ++o) c[o] = values[row * int64_t(corners[o]) + kDensitySlot];
+    // towards: from the origin to the cell's middle, of any length.
+    SmallLeafField(const RowNumber* values, const int32_t* corners, int degree, const float* towards) {
+        const float inverse = 1.0f / std::sqrt(dot3(towards, towards));
+        float b[16] = {};
+        sh_basis(degree, inverse * towards[0], inverse * towards[1], inverse * towards[2], b);
+        f16 basis[B];
+        for (int k = 0; k < B; ++k) {
+            const f4 four = load<f4>(b + 4 * k);
+            basis[k] = join(four, four, four, f4{k == 0 ? 1.0f : 0.0f, 0, 0, 0});
+        }
+        const f4 ninth = {b[8], b[8], b[8], 0};
+        for (int o = 0; o < 8; ++o) {
+            f16 terms{}, row;
+            for (int k = 0; k < B; ++k) {
+                read_row(values + 16 * (B * int64_t(corners[o]) + k), row);
+                terms += row * basis[k];
+            }
+            c[o] = quad_sums(terms);
+            if (B == 2) c[o] += ninth * quarter<3>(row);
+        }
         for (int axis = 1; axis < 8; axis *= 2)
             for (int o = 0; o < 8; ++o)
                 if (o & axis) c[o] -= c[o ^ axis];
     }
 
-    f16 at(const f16& x, const f16& y, const f16& z) const {
-        const f16 front = (c[0] + z * c[1]) + y * (c[2] + z * c[3]), back = (c[4] + z * c[5]) + y * (c[6] + z * c[7]);
+    f4 at(float x, float y, float z) const {
+        const f4 front = (c[0] + z * c[1]) + y * (c[2] + z * c[3]), back = (c[4] + z * c[5]) + y * (c[6] + z * c[7]);
         return front + x * back;
     }
 
     // d(raw density)/d(x, y, z) at a point.
-    void slope(float x, float y, float z, float* g) const {
-        g[0] = c[4] + z * c[5] + y * (c[6] + z * c[7]);
-        g[1] = c[2] + z * c[3] + x * (c[6] + z * c[7]);
-        g[2] = c[1] + y * c[3] + x * (c[5] + y * c[7]);
+    void density_slope(float x, float y, float z, float* g) const {
+        g[0] = c[4][3] + z * c[5][3] + y * (c[6][3] + z * c[7][3]);
+        g[1] = c[2][3] + z * c[3][3] + x * (c[6][3] + z * c[7][3]);
+        g[2] = c[1][3] + y * c[3][3] + x * (c[5][3] + y * c[7][3]);
     }
 };
-
-// Per ray: the basis, four numbers of each block together, as few as a picture's rays keep in the nearest cache.
-template <int B> struct Harmonics {
-    static constexpr int kRow = B == 2 ? 12 : 4 * B;
-    alignas(64) float row[kTile][kRow];
-
-    void fill(const Lanes& rays, int degree) {
-        for (int l = 0; l < kTile; ++l) {
-            float b[16] = {};
-            sh_basis(degree, rays.dx[l], rays.dy[l], rays.dz[l], b);
-            std::memcpy(row[l], b, sizeof(row[l]));
-        }
-    }
-};
-
-// (r, g, b, 0) of a cell at a point along a ray's basis, without the constant 1/2: eight weighted rows, for a cell is met by
-// two rays on average and a polynomial costs as much as three points.
-template <int B> f4 colour_at(const Cell& cell, float x, float y, float z, const float* basis) {
-    alignas(32) float w[8];
-    store(w, trilinear(x, y, z));
-    keep_in_memory(w);
-    f16 sum[B] = {};
-    for (int o = 0; o < 8; ++o)
-        for (int k = 0; k < B; ++k) {
-            f16 corner;
-            read_row(cell.values + 16 * (B * int64_t(cell.corners[o]) + k), corner);
-            sum[k] += w[o] * corner;
-        }
-    f16 terms{};
-    for (int k = 0; k < B; ++k) {
-        const f4 four = load<f4>(basis + 4 * k);
-        terms += sum[k] * join(four, four, four, f4{});
-    }
-    f4 out = quad_sums(terms);
-    if (B == 2) out += basis[8] * quarter<3>(sum[B - 1]);  // degree 2's ninth coefficients
-    return f4{out[0], out[1], out[2], 0.0f};
-}
 
 // sigma / density_scale: exponential below 1, linear above (value and slope are continuous).
 inline f16 explin(const f16& raw) { return select_less(raw, 1.0f, vexp(raw - 1.0f), raw); }
