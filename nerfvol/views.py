@@ -53,8 +53,9 @@ def render_image(
 ) -> dict[str, Float]:
     """One view: float32 arrays (H, W, 3) or (H, W) for the names in ``outputs`` (see ops.render_rays).
 
-    ``rgb`` is not clipped. 0 as ``early_stop_eps`` is exact: every ray goes to its end and is shaded along itself. A node of the octree that is smaller than ``lod`` pixels in the middle of the picture is
-    drawn in place of its leaves; 0: none is. ValueError where ``lod`` is negative or not finite.
+    ``rgb`` is not clipped. With 0 as ``early_stop_eps`` every ray goes to its end and is shaded along itself. A node of the
+    octree that is smaller than ``lod`` pixels in the middle of the picture is drawn in place of its leaves; 0: none is.
+    ValueError where ``lod`` is negative or not finite.
     """
     if not 0 <= lod < np.inf:
         raise ValueError(f"lod must be a number of pixels, 0 or more and finite, got {lod}")

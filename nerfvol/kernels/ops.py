@@ -82,8 +82,8 @@ def render_rays(
     sum_i w_i t_i (n,), median_depth (n,) the distance where T falls to 1/2 (0 where it does not), normal (n, 3) the
     weighted mean of unit normals. Distances in scene units. A ray ends when T < early_stop_eps, which changes a colour
     by less than that; 0 is exact. A node whose side is below ``coarse`` times the distance of its centre from the ray's
-    origin is drawn as one prefiltered cell (nerfvol.octree.lod); 0: none is. Raises ValueError where rays, background, threshold, outputs or
-    coarse are not what they should be.
+    origin is drawn as one prefiltered cell (nerfvol.octree.lod); 0: none is. Raises ValueError where rays, background,
+    threshold, outputs or coarse are not what they should be.
     """
     o, d = check_rays(rays_o, rays_d)
     bg, eps = check_background(background), check_early_stop(early_stop_eps)
