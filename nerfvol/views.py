@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 Float = NDArray[np.float32]
 _FAR, _SMALLEST, _LARGEST = 16.0, 2.0**-8, 2.0**20
 # Sides of the root cube from the origin, and sides in scene units, beyond which float32 loses digits that are seen.
+SMALL = 1 / 64
+"""Of its distance: a cell of a smaller side is shaded along one ray, where a picture need not be exact."""
 NEAREST = 1e-3
 """Of the extent of splats: what is nearer to a camera is not drawn, where the file says no more."""
 NOTEBOOK = "nerfvol.viewer.notebook"
@@ -51,15 +53,17 @@ def render_image(
 ) -> dict[str, Float]:
     """One view: float32 arrays (H, W, 3) or (H, W) for the names in ``outputs`` (see ops.render_rays).
 
-    ``rgb`` is not clipped. A node of the octree that is smaller than ``lod`` pixels in the middle of the picture is
-    drawn in place of its leaves; 0: none is. ValueError where ``lod`` is negative or not finite.
+    ``rgb`` is not clipped. With 0 as ``early_stop_eps`` every ray goes to its end and is shaded along itself. A node of the
+    octree that is smaller than ``lod`` pixels in the middle of the picture is drawn in place of its leaves; 0: none is.
+    ValueError where ``lod`` is negative or not finite.
     """
     if not 0 <= lod < np.inf:
         raise ValueError(f"lod must be a number of pixels, 0 or more and finite, got {lod}")
     lens = camera.intrinsics
     near, pose, scale = _near_origin(octree, camera)
     view = ops.View(_directions(lens), pose, lens.height, lens.width)
-    out = ops.render_view(near, view, background, early_stop_eps, outputs, lod / max(lens.fx, lens.fy))
+    small = SMALL if early_stop_eps > 0 else 0.0
+    out = ops.render_view(near, view, background, early_stop_eps, outputs, lod / max(lens.fx, lens.fy), small)
     if near is not octree:
         octree.prefiltered = near.prefiltered
         for name in ("depth", "median_depth"):

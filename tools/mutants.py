@@ -159,7 +159,7 @@ MUTANTS = (
     M("nerfvol/training/octree_end.py", "* (1 + loss)", "* (1 - loss)", "training/test_octree_trainer.py", "a last pruning that must gain"),
     M("nerfvol/training/octree_step.py", "chosen.sparsity * min(1.0, progress / max(chosen.decay_from, 1e-9))", "chosen.sparsity", "training/test_octree_trainer.py", "haze forbidden from the first step"),
     M("nerfvol/training/convert.py", "budget - after - begun", "budget - begun", "training/test_convert.py", "a conversion's budget without writing and scoring"),
-    M("nerfvol/kernels/csrc/around.cpp", "weight * basis[i] * missed", "basis[i] * missed", "starts/test_surfaces.py", "looks beside a surface count in full"),
+    M("nerfvol/kernels/csrc/looks.cpp", "weight * basis[i] * missed", "basis[i] * missed", "starts/test_surfaces.py", "looks beside a surface count in full"),
     M("nerfvol/kernels/csrc/adjoint.h", "/ (kSparseKnee + w)", "/ kSparseKnee", "kernels/test_train.py", "sparsity that costs surfaces as much as haze"),
     M("nerfvol/training/octree_trainer.py", "            needed |= solid(self.octree)", "            pass", "training/test_octree_trainer.py", "few views judge what is solid"),
     M("nerfvol/training/octree_trainer.py", "if not self.dataset.scene.is_unbounded:\n            return self.background", "if True:\n            return self.background", "training/test_octree_trainer.py", "one colour behind photographs"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
@@ -14,8 +14,10 @@ from nerfvol.config.values import Colour, Count, seconds, within
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:
+    from nerfvol.cameras.camera import Camera
     from nerfvol.datasets.dataset import Dataset
     from nerfvol.models import Model
+    from nerfvol.region import SceneBounds
 
 
 @dataclass
@@ -77,13 +79,18 @@ def run(options: ConvertOptions) -> int:
         )
     prepare_outputs(file=options.out)
     set_threads(options.threads)
-    data, downscale = _images_of(options)
-    if options.time_budget is not None and data is None:
+    images = _images_of(options)
+    if options.time_budget is not None and images is None:
         raise InputError("--time-budget trains on images: say which with --data DIR")
-    from nerfvol.datasets.load import load_dataset
+    from nerfvol.datasets.load import load_cameras, load_dataset
 
-    training, held_out = (None if data is None else load_dataset(data, split, downscale) for split in ("train", "val"))
-    model = _converted(options, target, training, 0 if held_out is None else len(held_out))
+    training = None if images is None or options.time_budget is None else load_dataset(split="train", **images)
+    if training is not None:
+        seen = training.cameras, training.scene
+    else:
+        seen = None if images is None else load_cameras(split="train", **images)
+    held_out = None if images is None else load_dataset(split="val", **images)
+    model = _converted(options, target, seen, training, 0 if held_out is None else len(held_out))
     _write(model, options, suffix)
     _say_cost(target, model, held_out)
     described = model.describe()
@@ -92,19 +99,30 @@ def run(options: ConvertOptions) -> int:
     return 0
 
 
-def _images_of(options: ConvertOptions) -> tuple[str | None, int]:
-    """The folder of images and their factor: as asked, else those of the run where they are still there."""
+def _images_of(options: ConvertOptions) -> dict[str, Any] | None:
+    """What load_dataset is given for the images: as asked, else as the run was, where they are still there; None: none."""
     settings = run_settings(options.target)
-    data = options.data
-    if data is None and settings.get("data") and Path(str(settings["data"])).exists():
-        data = str(settings["data"])
-    elif data is not None and not Path(data).exists():
-        raise InputError(f"--data {data}: no such folder or file")
-    return data, options.downscale or int(settings.get("downscale", 1))
+    own = settings.get("data") if options.data is None else None
+    if options.data is not None and not Path(options.data).exists():
+        raise InputError(f"--data {options.data}: no such folder or file")
+    data = options.data or (str(own) if own and Path(str(own)).exists() else None)
+    if data is None:
+        return None
+    images = {"path": data, "downscale": options.downscale or int(settings.get("downscale", 1))}
+    if own is not None:
+        images |= {name: settings[name] for name in ("holdout", "scene", "aabb") if settings.get(name) is not None}
+    return images
 
 
-def _converted(options: ConvertOptions, target: Target, training: Dataset | None, scored: int) -> Model:
-    """``scored``: views that the result will be compared on."""
+def _converted(
+    options: ConvertOptions,
+    target: Target,
+    seen: tuple[list[Camera], SceneBounds] | None,
+    training: Dataset | None,
+    scored: int,
+) -> Model:
+    """``seen``: the images' cameras and bounds; ``training``: the images, where there is time to train on them; ``scored``:
+    views that the result will be compared on."""
     from nerfvol.clouds import PointModel
     from nerfvol.config.training import Config
     from nerfvol.neural import FieldModel
@@ -113,38 +131,37 @@ def _converted(options: ConvertOptions, target: Target, training: Dataset | None
     from nerfvol.views import OctreeModel, SplatModel
 
     background, model = target.background, target.model
-    if training is None:
+    if seen is None:
         scene, cameras = convert.scene_around(model), convert.cameras_around(model)
     else:
-        scene, cameras = training.scene, convert.small_cameras(training.cameras, training.scene)
+        scene, cameras = seen[1], convert.small_cameras(*seen)
     config = Config(time_budget=options.time_budget, seed=options.seed)
     metadata = {k: v for k, v in model.metadata.items() if k in ("orbit", "provenance")} | {
         "background": list(background)
     }
     if options.to == "splats" and not isinstance(model, OctreeModel | FieldModel):
         raise InputError(f"{target.path} holds {model.kind}, and splats are made of an octree or a field alone")
-    trained = training is not None and options.time_budget is not None
-    if options.to == "splats" and isinstance(model, OctreeModel) and not trained:
+    if options.to == "splats" and isinstance(model, OctreeModel) and training is None:
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
-    if isinstance(model, SplatModel | PointModel) and training is not None and trained:
+    if isinstance(model, SplatModel | PointModel) and training is not None:
         # What pictures of the splats stand for is at hand.
         octree, config = convert.surfaces_to_train(model.splats, training, background, config, options.level)
         return OctreeModel(convert.tuned_octree(octree, training, background, config, scored), metadata)
     if isinstance(model, SplatModel | PointModel):
         octree = convert.octree_of(model.splats, scene, cameras, background, options.level, options.seed)
         return OctreeModel(octree, metadata)
-    seen = convert.seen_by(model, cameras, scene, background)
+    pictures = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, FieldModel):
-        octree = convert.octree_of_field(model, seen, background, options.level)
+        octree = convert.octree_of_field(model, pictures, background, options.level)
         if options.to == "octree":
-            if training is not None and options.time_budget is not None:
+            if training is not None:
                 octree = convert.tuned_octree(octree, training, background, config, scored)
             return OctreeModel(octree, metadata)
         model = OctreeModel(octree, metadata)
     assert isinstance(model, OctreeModel)
-    if training is None or not trained:
+    if training is None:
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
-    discs = convert.discs_of(model.octree, seen, background, options.max_splats)
+    discs = convert.discs_of(model.octree, pictures, background, options.max_splats)
     tuned = convert.tuned_splats(discs, training, background, config, scored)
     return SplatModel(tuned.packed, {**metadata, **tuned.metadata})
 

@@ -8,7 +8,7 @@ float32, and the finished model is brought back: x = scale * x' + shift. Ordinar
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -58,22 +58,23 @@ class Frame:
         """Points (..., 3) of the frame in scene units."""
         return points if self.is_identity else np.asarray(points, np.float64) * self.scale + self.shift
 
-    def _camera(self, camera: Camera, place: Float) -> Camera:
-        pose = camera.c2w.copy()
-        pose[:3, 3] = place
-        return replace(camera, c2w=pose)
+    def camera_into(self, camera: Camera) -> Camera:
+        """A camera in scene units as the frame has it."""
+        return camera if self.is_identity else _placed(camera, self.into(camera.position))
 
-    def _moved(self, dataset: Dataset, move: Any, frame: Frame | None) -> Dataset:
-        scene, read = dataset.scene, dataset.read_points
-        outer = None if scene.background_cube is None else move(scene.background_cube)
-        bounds = replace(scene, aabb=move(scene.aabb), background_cube=outer)
+    def scene_into(self, scene: SceneBounds) -> SceneBounds:
+        """Bounds in scene units as the frame has them."""
+        return scene if self.is_identity else _bounds(scene, self.into)
+
+    def _moved(self, dataset: Dataset, move: Callable[[Float], Float], frame: Frame | None) -> Dataset:
+        bounds, read = _bounds(dataset.scene, move), dataset.read_points
 
         def points() -> ModelPoints:
             assert read is not None
             found = read()
             return replace(found, positions=move(found.positions))
 
-        cameras = [self._camera(camera, move(camera.position)) for camera in dataset.cameras]
+        cameras = [_placed(camera, move(camera.position)) for camera in dataset.cameras]
         return replace(
             dataset, cameras=cameras, scene=bounds, read_points=None if read is None else points, frame=frame
         )
@@ -93,6 +94,13 @@ class Frame:
             octree.size, octree.density_scale = octree.size * self.scale, octree.density_scale / self.scale
         return octree
 
+    def octree_into(self, octree: Octree) -> Octree:
+        """An octree in scene units as the frame has it; itself, changed."""
+        if not self.is_identity:
+            octree.origin = self.into(octree.origin)
+            octree.size, octree.density_scale = octree.size / self.scale, octree.density_scale * self.scale
+        return octree
+
     def splats_back(self, splats: Splats) -> Splats:
         """Splats of the frame in scene units."""
         return splats if self.is_identity else _scaled(splats, self.scale, self.back(splats.origin))
@@ -107,6 +115,17 @@ class Frame:
             return dict(orbit)
         center = self.back(np.asarray(orbit["center"], np.float64))
         return {**orbit, "center": center.tolist(), "radius": orbit["radius"] * self.scale}
+
+
+def _placed(camera: Camera, place: Float) -> Camera:
+    pose = camera.c2w.copy()
+    pose[:3, 3] = place
+    return replace(camera, c2w=pose)
+
+
+def _bounds(scene: SceneBounds, move: Callable[[Float], Float]) -> SceneBounds:
+    outer = None if scene.background_cube is None else move(scene.background_cube)
+    return replace(scene, aabb=move(scene.aabb), background_cube=outer)
 
 
 def _scaled(splats: Splats, scale: float, origin: Float) -> Splats:

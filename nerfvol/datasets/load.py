@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,28 +14,14 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.cameras.focus import focus_point
 from nerfvol.datasets.bounds import bounds_of_box, bounds_of_points, estimate_bounds, require_seen
 from nerfvol.datasets.dataset import Dataset, evenly
+from nerfvol.datasets.decoding import decoded, on_masks, readable, settle_alpha
 from nerfvol.datasets.extras import unread
 from nerfvol.datasets.formats import SPLITS, find_format
-from nerfvol.datasets.frames import (
-    View,
-    unread_sentence,
-    views_of,
-    with_circles,
-    with_common_masks,
-)
+from nerfvol.datasets.frames import View, views_of, with_circles, with_common_masks
 from nerfvol.datasets.holdout import HOLDOUTS, hold_out_arc
-from nerfvol.datasets.images import (
-    UInt8,
-    area_average,
-    map_threads,
-    masked_average,
-    read_image,
-    read_pixels,
-    turned,
-    writeable,
-)
+from nerfvol.datasets.images import UInt8, map_threads
 from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
-from nerfvol.datasets.listing import Frame, Listing, listed_names, named, require_few
+from nerfvol.datasets.listing import Frame, Listing, listed_names, named
 from nerfvol.datasets.odd_ones import blank, dim
 from nerfvol.datasets.sampled import Sampled, sample, seen_small
 from nerfvol.datasets.store import ImageStore
@@ -71,6 +57,94 @@ def load_dataset(
     Raises:
         InputError: where the files cannot be used, in one sentence that names the file.
     """
+    found = _find(path, split, downscale, aabb, threads, holdout, scene, most)
+    _require_memory([view.camera.scaled(downscale) for view in found.views], downscale)
+    views, messages, decision, listing = found.views, found.messages, found.decision, found.listing
+    # In photographs of a place what is transparent was not seen, by whatever cut it out.
+    cut_out = decision.kind != "object"
+
+    def decode(views: Sequence[View]) -> tuple[list[UInt8], list[UInt8 | None]]:
+        made = map_threads(lambda view: decoded(view, found.sampled.get(view.path), downscale, cut_out), views, threads)
+        return settle_alpha([image for image, _ in made], listing.source), [mask for _, mask in made]
+
+    try:
+        images, masks = decode(views)
+    except InputError:  # found out which: once it is known that one is damaged, the time does not matter
+        views = readable(views, messages, threads)
+        images, masks = decode(views)
+    found.release()
+    if nothing := blank(views, images, messages):
+        kept = [i for i in range(len(views)) if i not in nothing]
+        views, images, masks = [views[i] for i in kept], [images[i] for i in kept], [masks[i] for i in kept]
+    cameras = [view.camera.scaled(downscale) for view in views]
+    require_seen(found.bounds, cameras)
+    messages += on_masks(views, masks, images)
+    store = ImageStore(len(images), lambda: decode(views)[0], images)
+    names, source = listed_names([view.frame for view in views]), str(listing.source)
+    evidence = found.evidence
+    backdrop = evidence.backdrop if decision.kind == "object" and not evidence.see_through else None
+    some = masks if any(mask is not None for mask in masks) else None
+    return Dataset(
+        cameras,
+        store,
+        names,
+        found.bounds,
+        source,
+        messages,
+        threads,
+        listing.read_points,
+        some,
+        backdrop,
+        decision.kind,
+    )
+
+
+def load_cameras(
+    path: str | os.PathLike[str],
+    split: str = "train",
+    downscale: int = 1,
+    aabb: ArrayLike | None = None,
+    threads: int | None = None,
+    holdout: str = "own",
+    scene: str = "auto",
+) -> tuple[list[Camera], SceneBounds]:
+    """The cameras and the bounds that :func:`load_dataset` has, from as many pictures as tell what kind of scene it is.
+
+    Those of pictures that turn out to be blank or damaged are among them.
+
+    Raises:
+        InputError: as load_dataset, of what comes before the pictures are decoded.
+    """
+    found = _find(path, split, downscale, aabb, threads, holdout, scene, None)
+    found.release()
+    cameras = [view.camera.scaled(downscale) for view in found.views]
+    require_seen(found.bounds, cameras)
+    return cameras, found.bounds
+
+
+@dataclass(eq=False)
+class _Found:
+    """A split before its pictures are decoded; ``sampled``: those that were, to be judged by."""
+
+    listing: Listing
+    views: list[View]
+    sampled: dict[Path, Sampled]
+    bounds: SceneBounds
+    decision: Decision
+    evidence: Evidence
+    messages: list[str]
+
+    def release(self) -> None:
+        """Gives up the pictures that nobody took."""
+        for picture in self.sampled.values():
+            picture.take()
+
+
+def _find(
+    path: str | os.PathLike[str], split: str, downscale: int, aabb: ArrayLike | None, threads: int | None, holdout: str,
+    scene: str, most: int | None,
+) -> _Found:  # fmt: skip
+    """The views of a split, with masks and circles, and where the scene is."""
     box = _checked(split, downscale, holdout, scene, aabb)
     row = find_format(Path(path))
     reader = row.reader
@@ -83,7 +157,6 @@ def load_dataset(
     views, training_views = views_of(frames, training, listing.source, messages, threads)
     if most is not None and len(views) > most:
         views = [views[i] for i in evenly(len(views), most)]
-    _require_memory([view.camera.scaled(downscale) for view in views], downscale)
     views = with_common_masks(views, training_views, messages)
     judged, sampled = sample(training_views, threads)
     views, circles = with_circles(views, judged, messages)
@@ -91,33 +164,7 @@ def load_dataset(
     evidence = look(*seen_small(judged))
     bounds, decision, said = _scene_of(listing, training_views, box, evidence, scene)
     messages += [*dim([picture for _, picture in judged]), *decision.doubts, decision.sentence, said]
-    # In photographs of a place what is transparent was not seen, by whatever cut it out.
-    cut_out = decision.kind != "object"
-
-    def decode(views: Sequence[View]) -> tuple[list[UInt8], list[UInt8 | None]]:
-        made = map_threads(lambda view: _decoded(view, sampled.get(view.path), downscale, cut_out), views, threads)
-        return _settle_alpha([image for image, _ in made], listing.source), [mask for _, mask in made]
-
-    try:
-        images, masks = decode(views)
-    except InputError:  # found out which: once it is known that one is damaged, the time does not matter
-        views = _readable(views, messages, threads)
-        images, masks = decode(views)
-    for picture in sampled.values():
-        picture.take()
-    if nothing := blank(views, images, messages):
-        kept = [i for i in range(len(views)) if i not in nothing]
-        views, images, masks = [views[i] for i in kept], [images[i] for i in kept], [masks[i] for i in kept]
-    cameras = [view.camera.scaled(downscale) for view in views]
-    require_seen(bounds, cameras)
-    messages += _on_masks(views, masks, images)
-    store = ImageStore(len(images), lambda: decode(views)[0], images)
-    names, source = listed_names([view.frame for view in views]), str(listing.source)
-    backdrop = evidence.backdrop if decision.kind == "object" and not evidence.see_through else None
-    some = masks if any(mask is not None for mask in masks) else None
-    return Dataset(
-        cameras, store, names, bounds, source, messages, threads, listing.read_points, some, backdrop, decision.kind
-    )
+    return _Found(listing, views, sampled, bounds, decision, evidence, messages)
 
 
 def _checked(
@@ -133,25 +180,6 @@ def _checked(
     if holdout not in HOLDOUTS:
         raise InputError(f"holdout must be one of {', '.join(HOLDOUTS)}, got {holdout!r}")
     return None if aabb is None else check_box(aabb, "aabb")
-
-
-def _readable(views: Sequence[View], messages: list[str], threads: int | None) -> list[View]:
-    """The views whose pictures are whole, where few are not; a sentence tells of the others."""
-
-    def damage(view: View) -> InputError | None:
-        try:
-            read_image(view.path)
-            view.seen()
-        except InputError as error:
-            return error
-        return None
-
-    found = map_threads(damage, views, threads)
-    wrong = [error for error in found if error is not None]
-    require_few(wrong, len(views))
-    if wrong:
-        messages.append(unread_sentence(wrong))
-    return [view for view, error in zip(views, found, strict=True) if error is None]
 
 
 def _scene_of(
@@ -187,45 +215,6 @@ def _of_box(box: NDArray[np.float64], cameras: Sequence[Camera], what: str) -> s
     )
 
 
-def _decoded(view: View, sampled: Sampled | None, downscale: int, cut_out: bool) -> tuple[UInt8, UInt8 | None]:
-    """A view's image and mask at its final size; of ``sampled`` where that has it whole."""
-    whole = None if sampled is None else sampled.take()
-    image = read_pixels(view.path, view.orientation) if whole is None else turned(whole, view.orientation)
-    mask = view.seen()
-    lens = view.camera.intrinsics
-    if image.shape[:2] != (lens.height, lens.width):
-        raise InputError(f"{view.path}: the image is not of the size its header declares")
-    if cut_out and image.shape[2] == 4:
-        unseen = image[..., 3] < 128
-        if unseen.any() and not unseen.all():
-            kept = np.where(unseen, 0, 255).astype(np.uint8)
-            mask = kept if mask is None else np.minimum(mask, kept)
-        image = np.ascontiguousarray(image[..., :3]) if not unseen.all() else image
-    if mask is None:
-        return writeable(area_average(image, downscale)), None
-    image, mask = masked_average(image, mask, downscale)
-    return writeable(image), mask
-
-
-def _on_masks(views: Sequence[View], masks: Sequence[UInt8 | None], images: Sequence[UInt8]) -> list[str]:
-    """Sentences on what is left out of pictures; InputError where nothing is left of any."""
-    said = []
-    empty = [view.frame.listed for view, mask in zip(views, masks, strict=True) if mask is not None and not mask.any()]
-    if len(empty) == len(views):
-        raise InputError(f"{views[0].path}: the masks of all {len(views)} images leave nothing to look at")
-    if empty:
-        said.append(f"the masks of {len(empty)} images leave nothing of them: {named(empty)}")
-    by_alpha = [
-        view.frame.listed for view, mask in zip(views, masks, strict=True) if mask is not None and view.seen() is None
-    ]
-    if by_alpha:
-        said.append(
-            f"{len(by_alpha)} of {len(views)} photographs have transparent pixels: they count as not seen, and take no part in "
-            f"training and scores: {named(by_alpha)}"
-        )
-    return said
-
-
 def _without_arc(listing: Listing, split: str) -> Listing:
     """The listing of the training split as one of the arc, or of what is left of it."""
     present = [frame for frame in listing.frames if frame.path is not None]
@@ -255,7 +244,7 @@ def _present(listing: Listing, messages: list[str]) -> list[Frame]:
 
 
 def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
-    """Refuses a set of images that cannot fit in memory (the machine's, or its container's limit) before decoding any."""
+    """Refuses a set of images that cannot fit in memory (the machine's, or its container's limit) before they are decoded."""
     need = sum(4 * camera.intrinsics.width * camera.intrinsics.height for camera in cameras)
     have = total_memory()
     if have is not None and need > 0.8 * have:  # on a platform that does not tell, decode and see
@@ -264,13 +253,3 @@ def _require_memory(cameras: Sequence[Camera], downscale: int) -> None:
             f"{len(cameras)} images need {need / 2**30:.1f} GiB and there are {have / 2**30:.1f} GiB of memory; "
             f"use a downscale of {factor} or more"
         )
-
-
-def _settle_alpha(images: list[UInt8], source: Path) -> list[UInt8]:
-    """Drops alpha channels where no image of the split uses one; refuses a split in which nothing is visible."""
-    with_alpha = [image for image in images if image.shape[2] == 4]
-    if len(with_alpha) == len(images) and not any(image[..., 3].any() for image in images):
-        raise InputError(f"{source}: all {len(images)} images are fully transparent, so there is nothing to learn from")
-    if any(image[..., 3].min() < 255 for image in with_alpha):
-        return images
-    return [np.ascontiguousarray(image[..., :3]) for image in images]

@@ -104,8 +104,12 @@ def render_view(
     early_stop_eps: float = DEFAULT_EARLY_STOP,
     outputs: Sequence[str] = OUTPUTS,
     coarse: float = 0.0,
+    small: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Renders a camera's picture; results as in :func:`render_rays`, (height, width[, 3]).
+
+    small: cells whose side is below so many times their distance have the spherical harmonics of the ray through their
+    middle for all rays; 0 (and the reference, always): none.
 
     Raises ValueError where the view is no float32 array of squares or not finite, and as render_rays does.
     """
@@ -126,7 +130,7 @@ def render_view(
         return {name: rows.reshape(height, width, *rows.shape[1:]) for name, rows in rays.items()}
     out = _empty_outputs(outputs, (height, width))
     tree = kernel_tree(octree, np.ascontiguousarray(octree.values, dtype=np.float32), coarse)
-    frame = (rotation.ravel().tolist(), origin.tolist(), height, width)
+    frame = (rotation.ravel().tolist(), origin.tolist(), height, width, float(small))
     compiled.render_view(tree, directions, *frame, bg, eps, *(out.get(name) for name in OUTPUTS))
     return _finished(out)
 

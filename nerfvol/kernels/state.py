@@ -150,3 +150,13 @@ class TrainState(LeafStatistics):
         self._check_array("moments", octree.values.shape, np.float32)
         self._check_array("slots", (octree.n_vertices,), np.int32)
         super().check(octree)
+
+    def level_moments(self, share: float) -> None:
+        """After a first step: sets every second moment to ``share`` of its column's mean over the vertices that were touched.
+
+        A vertex's own first gradient would make its first step as long as any, however small it is; where a run has few
+        steps, those of vertices that hardly matter are noise.
+        """
+        touched = self.moments > 0
+        mean = self.moments.sum(0, dtype=np.float64) / np.maximum(touched.sum(0), 1)
+        self.moments[:] = share * mean

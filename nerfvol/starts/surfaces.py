@@ -81,7 +81,7 @@ def write_surfaces(octree: Octree, views: Sequence[Seen]) -> None:
     raw = explin_inverse(np.maximum(thickness / side / octree.density_scale, 1e-30))
     values, chosen = octree.values, np.flatnonzero(surface)
     values[:, DENSITY_SLOT] = np.maximum(raw, EMPTY_DENSITY)
-    values[chosen[:, None, None], slots] = sh[chosen]
+    values[chosen[:, None], slots.reshape(-1)] = sh[chosen].reshape(-1, slots.size)
     octree.prefiltered = None
 
 
@@ -92,16 +92,15 @@ def _pose(camera: Camera) -> NDArray[np.float64]:
 
 
 def _look_compiled(views: Sequence[Seen], vertices: _Vertices) -> None:
-    """csrc/around.cpp, in float64, for any number of threads the same."""
+    """csrc/looks.cpp, in float64, for any number of threads the same."""
     compiled = native()
     assert compiled is not None
     compiled.look_at_vertices(
         rgb=[np.ascontiguousarray(view.rgb, np.float32) for view in views],
-        opacity=[np.ascontiguousarray(view.opacity, np.float32) for view in views],
-        distance=[np.ascontiguousarray(view.distance, np.float32) for view in views],
+        distance=[np.where(v.opacity <= NOTHING, np.inf, v.distance).astype(np.float32) for v in views],
         poses=np.stack([_pose(view.camera) for view in views]),
         lenses=np.array([(v.fx, v.fy, v.cx, v.cy) for v in (view.camera.intrinsics for view in views)], np.float64),
-        verdict=[REACH, BEFORE, NOTHING, KEEP], **vars(vertices),
+        verdict=[REACH, BEFORE, KEEP], **vars(vertices),
     )  # fmt: skip
 
 

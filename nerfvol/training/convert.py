@@ -24,6 +24,7 @@ from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.dataset import evenly as even_places
 from nerfvol.datasets.frame import Frame
+from nerfvol.datasets.images import map_threads
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.machine import process_seconds
@@ -51,8 +52,10 @@ MOST_DISCS = 100_000
 """Surfels of an octree where nobody says how many."""
 FITTED_VIEWS, FITTED_VIEWS_OF_OBJECTS = 100, 50
 """Pictures of the splats that their octree is fitted to, at most."""
-FITTED_STEPS = 144
-"""Steps of the fit, which begins with the surfaces found (starts/surfaces.py): some two seconds on two cores."""
+FITTED_STEPS = 100
+"""Steps of the fit, which begins with the surfaces found (starts/surfaces.py): some one and a half seconds on two cores."""
+LEVELLED = 0.03
+"""Share of the mean that its second moments begin with: worth 40 steps (docs/experiments.md)."""
 LOOKS = 32
 """Pictures that tell surfaces from the free before the fit."""
 EMPTY = 0.02
@@ -139,13 +142,20 @@ def octree_of(
     Raises:
         InputError: no splat lies in the scene's region, or none is seen.
     """
+    frame = Frame.of(scene)
+    if not frame.is_identity:  # float32 tells no rays of map coordinates apart
+        octree = octree_of(*_moved(frame, splats, scene, cameras), background, level, seed)
+        return frame.octree_back(octree)
     level = finest_level(scene, cameras) if level is None else level
-    views, images = looked_at(SplatModel(splats), small_cameras(cameras, scene), background)
+    fitted = [_without_lens(camera) for camera in small_cameras(cameras, scene)]
+    views, images = looked_at(SplatModel(splats), fitted, background)
     octree = _with_surfaces(octree_around(splats, scene, cameras, level), views)
-    seen = _dataset([view.camera for view in views], images, scene, SplatModel.kind)
+    seen = _dataset(fitted, images, scene, SplatModel.kind)
     trainer = OctreeTrainer(seen, background, OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT), seed, octree)
     for step in range(FITTED_STEPS):
         trainer.step(step / FITTED_STEPS)
+        if step == 0:
+            trainer.state.level_moments(LEVELLED)
     return trainer.octree
 
 
@@ -158,6 +168,9 @@ def surfaces_of(
     level: as in :func:`octree_of`, which raises the same; None: around photographs one finer, for what is nearer than the
     scene's middle has smaller pixels, and no leaf is finer than those that see it ask for, nor than ``most_level``.
     """
+    frame = Frame.of(scene)
+    if not frame.is_identity:
+        return frame.octree_back(surfaces_of(*_moved(frame, splats, scene, cameras), background, level, most_level))
     if level is None:
         level = min(finest_level(scene, cameras) + scene.is_unbounded, most_level)
     octree = octree_around(splats, scene, cameras, level)
@@ -183,28 +196,49 @@ def surfaces_to_train(
     return surfaces_of(splats, scene, cameras, background, level), config
 
 
+def _moved(
+    frame: Frame, splats: Splats, scene: SceneBounds, cameras: Sequence[Camera]
+) -> tuple[Splats, SceneBounds, list[Camera]]:
+    return frame.splats_into(splats), frame.scene_into(scene), [frame.camera_into(camera) for camera in cameras]
+
+
 def _with_surfaces(octree: Octree, views: Sequence[Seen]) -> Octree:
-    """Of splats as they stand, what LOOKS of ``views`` tell; without the leaves that are empty then."""
-    write_surfaces(octree, evenly(views, LOOKS))
+    """Of splats as they stand, what ``views`` tell; without the leaves that are empty then. InputError where all are."""
+    write_surfaces(octree, views)
     solid = thickness(octree) >= EMPTY
-    return octree.prune(solid)[0] if solid.any() else octree
+    if not solid.any():
+        finest = octree.leaf_sizes().min()
+        raise InputError(
+            f"none of the splats is seen: they are transparent, or far smaller than the finest leaves ({finest:.3g})"
+        )
+    return octree.prune(solid)[0]
 
 
 def looked_at(
     model: Model, cameras: Sequence[Camera], background: Sequence[float]
 ) -> tuple[list[Seen], list[NDArray[np.uint8]]]:
-    """What ``cameras`` see of a model, with distances, as pinholes; and the same as pictures over ``background``."""
-    views, images = [], []
-    for given in cameras:
-        lens = given.intrinsics
-        camera = given.through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
-        image = model.render(camera, background, ("rgb", "opacity", "median_depth"))
+    """What LOOKS of ``cameras`` see of a model, with distances, as pinholes; and what all of them see over ``background``."""
+    looks = set(evenly(range(len(cameras)), LOOKS))
+
+    def look(i: int) -> tuple[Seen | None, NDArray[np.uint8]]:
+        camera = _without_lens(cameras[i])
+        outputs = ("rgb", "opacity", "median_depth") if i in looks else ("rgb",)
+        image = model.render(camera, background, outputs)
+        if i not in looks:
+            return None, _bytes_of(image["rgb"])
         opacity = image["opacity"]
         through = (1 - opacity)[..., None] * np.asarray(background, np.float32)
         rgb = (image["rgb"] - through) / np.maximum(opacity, 1 / 255)[..., None]
-        views.append(Seen(camera, rgb, opacity, image["median_depth"]))
-        images.append(_bytes_of(image["rgb"]))
-    return views, images
+        return Seen(camera, rgb, opacity, image["median_depth"]), _bytes_of(image["rgb"])
+
+    # One picture is drawn while another is worked over.
+    made = map_threads(look, range(len(cameras)), 2)
+    return [seen for seen, _ in made if seen is not None], [image for _, image in made]
+
+
+def _without_lens(camera: Camera) -> Camera:
+    lens = camera.intrinsics
+    return camera.through(Intrinsics(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy))
 
 
 def octree_of_field(
@@ -241,10 +275,12 @@ def tuned_octree(
 
     The budget counts from the start of the process; writing, and scoring ``scored`` views with both models, lie within it.
     """
+    frame = Frame.of(dataset.scene)
+    dataset, octree = frame.dataset_into(dataset), frame.octree_into(octree)
     settings = dataclasses.replace(config.octree.from_surfaces(dataset.scene), steps=FINE_STEPS)
     trainer = OctreeTrainer(dataset, background, settings, config.seed, octree)
     _run(trainer, dataset.cameras[0], config.time_budget, scored, say)
-    return trainer.finish()
+    return frame.octree_back(trainer.finish())
 
 
 def tuned_splats(

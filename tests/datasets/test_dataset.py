@@ -6,9 +6,9 @@ import os
 import numpy as np
 import pytest
 
-from nerfvol.datasets import load, sampled
+from nerfvol.datasets import decoding, sampled
 from nerfvol.datasets.dataset import NEAR_SHARE, Dataset
-from nerfvol.datasets.load import load_dataset
+from nerfvol.datasets.load import load_cameras, load_dataset
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
 from tests.fixtures.scenes import random_images, ring
@@ -101,8 +101,8 @@ def test_only_the_views_that_are_wanted_are_decoded(tmp_path, monkeypatch):
     """``most``: evenly chosen, the same that Dataset.evenly takes of all."""
     write_scene(tmp_path, {"train": 5, "val": 7}, size=20)
     everything = load_dataset(tmp_path, "val").evenly(3)
-    read, asked = load.read_pixels, []
-    monkeypatch.setattr(load, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
+    read, asked = decoding.read_pixels, []
+    monkeypatch.setattr(decoding, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
     some = load_dataset(tmp_path, "val", most=3)
     assert some.names == everything.names == ["r_0", "r_3", "r_6"] and sorted(asked) == [
         "r_0.png",
@@ -117,8 +117,8 @@ def test_only_the_views_that_are_wanted_are_decoded(tmp_path, monkeypatch):
 def test_what_was_decoded_to_judge_the_scene_is_not_decoded_again(tmp_path, monkeypatch, downscale):
     """Pictures larger than those that are looked at: taken over whole, once, and then read again like all others."""
     write_scene(tmp_path, {"train": 3, "val": 1}, size=300)
-    read, asked = load.read_pixels, []
-    monkeypatch.setattr(load, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
+    read, asked = decoding.read_pixels, []
+    monkeypatch.setattr(decoding, "read_pixels", lambda path, *rest: asked.append(path.name) or read(path, *rest))
     sampled._sampled.cache_clear()
     dataset = load_dataset(tmp_path, "train", downscale)
     first = [image.copy() for image in dataset.images]
@@ -127,3 +127,18 @@ def test_what_was_decoded_to_judge_the_scene_is_not_decoded_again(tmp_path, monk
     for a, b in zip(first, dataset.images, strict=True):
         np.testing.assert_array_equal(a, b)
     assert sorted(asked) == ["r_0.png", "r_1.png", "r_2.png"]
+
+
+@pytest.mark.parametrize("settings", [{}, {"downscale": 2, "holdout": "arc"}, {"scene": "surroundings"}])
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_cameras_alone_are_those_of_the_pictures_and_decode_none_of_them(tmp_path, monkeypatch, split, settings):
+    write_scene(tmp_path, {"train": 30, "val": 7}, size=20)
+    dataset = load_dataset(tmp_path, split, **settings)
+    monkeypatch.setattr(decoding, "read_pixels", None)
+    cameras, scene = load_cameras(tmp_path, split, **settings)
+    assert len(cameras) == len(dataset) > 1
+    for camera, other in zip(cameras, dataset.cameras, strict=True):
+        assert camera.intrinsics == other.intrinsics
+        np.testing.assert_array_equal(camera.c2w, other.c2w)
+    np.testing.assert_array_equal(scene.aabb, dataset.scene.aabb)
+    assert scene.n_shells == dataset.scene.n_shells

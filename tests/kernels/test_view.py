@@ -58,6 +58,30 @@ def test_views_agree_with_rays(isa, kind, degree):
                     np.testing.assert_allclose(value, want, rtol=0, atol=60 * unit * 2**-24, err_msg=name)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_small_cell_is_shaded_along_the_ray_to_its_middle(isa, degree):
+    """A colour moves by what the harmonics do over sqrt(3)/2 of 1/64, the most between a
+    ray and the one to the middle of a cell 64 sides away. The squares of the slopes of all harmonics of degree l add up to
+    (2 l + 1) l (l + 1) / (4 pi) [addition theorem]. Cells that are nearer stay as they are, bit by bit."""
+    rng = np.random.default_rng(degree)
+    octree = random_octree("full", degree, rng)
+    slope = np.concatenate(
+        [np.full(2 * k + 1, np.sqrt((2 * k + 1) * k * (k + 1) / (4 * np.pi))) for k in range(degree + 1)]
+    )
+    bound = np.sqrt(3) / 2 / 64 * (np.abs(octree.sh) @ slope).max()
+    for away, is_small in ((200.0, True), (0.9, False)):
+        view, _, _ = view_of(octree, rng, 45, 35, 40.0 * away, away)
+        exact, quick = (ops.render_view(octree, view, (0.1, 0.5, 0.9), 0.0, small=small) for small in (0.0, 1 / 64))
+        moved = np.abs(quick["rgb"] - exact["rgb"])
+        if not is_small:
+            assert not moved.any()
+            continue
+        rounding = 60 * 3 * 2**-24
+        assert moved.max() <= bound + rounding and (moved.max() > rounding) == (degree > 0)
+        for name in ("opacity", "normal"):
+            np.testing.assert_allclose(quick[name], exact[name], rtol=0, atol=rounding, err_msg=name)
+
+
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_ray_that_ends_ends_no_other(isa, degree):
     """Two cells of nine of a board stand before a haze: pixels that see the haze share patches with pixels that end."""

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.cameras.camera import Camera, Intrinsics, orbit
 from nerfvol.config.octree import PHOTOGRAPHS_FROM_SURFACES, OctreeConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.measure.metrics import psnr
 from nerfvol.region import SceneBounds
@@ -163,11 +164,19 @@ def test_what_is_looked_at_are_the_pictures_of_the_fit(converted):
         opacity = view.opacity[..., None]
         again = 255 * (view.rgb * opacity + (1 - opacity) * np.array(WHITE))
         assert np.abs(again - image).max() < 0.5 + 1
-    assert [len(convert.evenly(range(n), 5)) for n in (3, 5, 9)] == [3, 5, 5] and convert.evenly(range(9), 3) == [
-        0,
-        4,
-        8,
+    assert [len(convert.evenly(range(n), 5)) for n in (3, 5, 9)] == [3, 5, 5]
+    assert convert.evenly(range(9), 3) == [0, 4, 8]
+
+
+def test_few_pictures_are_looks_and_all_are_fitted_to(converted, monkeypatch):
+    discs, seen, _ = converted
+    monkeypatch.setattr(convert, "LOOKS", 3)
+    views, images = convert.looked_at(discs, seen.cameras, WHITE)
+    assert [view.camera.position.tolist() for view in views] == [
+        camera.position.tolist() for camera in convert.evenly(seen.cameras, 3)
     ]
+    for image, taken in zip(images, seen.images, strict=True):
+        np.testing.assert_array_equal(image, taken)
 
 
 @pytest.mark.parametrize("is_unbounded", [False, True])
@@ -190,3 +199,52 @@ def test_photographs_are_tuned_with_settings_of_their_own(monkeypatch, is_unboun
         (own["sparsity"], own["decay_from"]),
         (0.5, own["decay_from"]),
     ]
+
+
+@pytest.mark.parametrize("offset, scale", [((4e5, 5e6, 100.0), 1.0), ((0.0, 0.0, 0.0), 1e6)])
+def test_where_the_scene_is_and_in_what_unit_changes_nothing(monkeypatch, offset, scale):
+    """In map coordinates, where float32 tells no two rays apart, and in units a million times smaller."""
+    monkeypatch.setattr(convert, "FITTED_STEPS", 20)
+    discs, offset = sphere_of_discs(400).splats, np.array(offset)
+    moved = Splats(
+        scale * discs.means,
+        discs.log_scales + np.log(scale),
+        discs.quats,
+        discs.logits,
+        discs.sh,
+        discs.origin + offset,
+    )
+    there = SceneBounds(scale * SCENE.aabb + offset, None, False)
+    around = cameras(4, -30) + cameras(4, 30)
+    placed = []
+    for camera in around:
+        pose = camera.c2w.copy()
+        pose[:3, 3] = scale * pose[:3, 3] + offset
+        placed.append(Camera(camera.intrinsics, pose))
+    here, far = octree_of(discs, SCENE, around, WHITE, 4), octree_of(moved, there, placed, WHITE, 4)
+    np.testing.assert_allclose(far.origin, scale * here.origin + offset, rtol=0, atol=1e-9 * scale)
+    error = [
+        psnr(OctreeModel(octree).render(camera, WHITE)["rgb"], discs_model.render(camera, WHITE)["rgb"])
+        for octree, discs_model, camera in ((here, SplatModel(discs), around[1]), (far, SplatModel(moved), placed[1]))
+    ]
+    # What differs is rounding, which a fit of 20 steps carries on; rays that are not told apart lose tens of dB.
+    assert abs(error[0] - error[1]) < 1 and error[0] > 25
+
+
+def test_splats_that_no_leaf_shows_are_refused():
+    discs = sphere_of_discs(50).splats
+    discs.logits[:] = -9
+    with pytest.raises(InputError, match="none of the splats is seen"):
+        octree_of(discs, SCENE, cameras(4, 20), WHITE, 4)
+
+
+def test_one_gaussian_alone_becomes_an_octree():
+    one = sphere_of_discs(1).splats
+    one.log_scales[:] = np.log(0.2)
+    one.means[:] = 0.1
+    octree = octree_of(one, SCENE, cameras(6, -30) + cameras(6, 30), WHITE, LEVEL)
+    view = cameras(3, 5)[1]
+    drawn = [model.render(view, WHITE, ("rgb", "opacity")) for model in (SplatModel(one), OctreeModel(octree))]
+    assert psnr(drawn[1]["rgb"], drawn[0]["rgb"]) > 25
+    assert abs(drawn[1]["opacity"].mean() - drawn[0]["opacity"].mean()) < 0.1 * drawn[0]["opacity"].mean()
+    assert np.linalg.norm(octree.leaf_centers() - 0.1, axis=1).max() < 3 * 0.2

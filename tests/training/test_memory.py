@@ -14,7 +14,7 @@ from PIL import Image
 from nerfvol.cameras.camera import Intrinsics
 from nerfvol.cameras.lens import BrownConrady
 from nerfvol.cameras.paths import orbit
-from nerfvol.datasets import load
+from nerfvol.datasets import decoding
 from nerfvol.datasets.load import load_dataset
 from nerfvol.datasets.photographs import FACTORS, Photographs
 from nerfvol.datasets.store import ImageStore
@@ -227,7 +227,7 @@ def many_photographs(folder, n):
 
 def test_many_photographs_are_shrunk_as_many_at_a_time_as_there_are_threads(tmp_path, monkeypatch):
     """Bytes are counted, not megabytes of pictures made: at full size one picture for each thread."""
-    held, most, lock, read = [0], [0], threading.Lock(), load.read_pixels
+    held, most, lock, read = [0], [0], threading.Lock(), decoding.read_pixels
 
     def count(more):
         with lock:
@@ -240,7 +240,7 @@ def test_many_photographs_are_shrunk_as_many_at_a_time_as_there_are_threads(tmp_
         weakref.finalize(pixels, count, -pixels.nbytes)
         return pixels
 
-    monkeypatch.setattr(load, "read_pixels", counted)
+    monkeypatch.setattr(decoding, "read_pixels", counted)
     data = load_dataset(many_photographs(tmp_path, 150), "train", downscale=2, threads=3)
     assert data.nbytes == len(data) * 20 * 15 * 3 and len(data) > 120 and held[0] == 0
     assert 0 < most[0] <= 3 * 40 * 30 * 3

@@ -104,7 +104,8 @@ void forward_packet(const Tree& tree, Packet<1>& p, const BasisRows<B>& basis, f
     work.size = 0;
     work.visits.clear();
     work.first_hit.clear();
-    work.tested = march<B>(tree, p, [&](const Leaf& leaf, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
+    work.tested = march<B>(tree, p, [&](const Leaf& leaf, const uint64_t* hits, const Segments* segments, const Cell& c) {
+        const LeafField<B> field(c.values, c.corners);
         const Segments& s = segments[0];
         const int m = __builtin_popcountll(hits[0]);
         const size_t base = work.size;
@@ -128,9 +129,9 @@ void forward_packet(const Tree& tree, Packet<1>& p, const BasisRows<B>& basis, f
             h[i].weight = w;
             h[i].trans_after = state.trans[l] = before * x.through[i];
             h[i].tau_slope = x.slope[i];
-            f4 c = h[i].value + 0.5f;
-            c[3] = h[i].middle;
-            state.colour[l] += w * c;
+            f4 value = h[i].value + 0.5f;
+            value[3] = h[i].middle;
+            state.colour[l] += w * value;
             visit.max_weight = std::max(visit.max_weight, w);
             visit.near = std::min(visit.near, h[i].middle);
             if (h[i].trans_after < eps) p.strips[0].alive &= ~(1ull << l);

@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <iterator>
+#include <utility>
 
 #include "pool.h"
 #include "topology.h"
@@ -56,80 +58,6 @@ int64_t leaf_at(const Masks& octree, int64_t level, int64_t code) {
 
 double coordinate(int64_t code, int axis) { return double(gather_bits(uint64_t(code) >> (2 - axis))) + 0.5; }
 
-constexpr int kMost = 4;                       // coefficients of a colour
-
-// Solves a x = b for three right sides; a (k, k) is positive definite and is overwritten [Cholesky].
-void solve(double (&a)[kMost][kMost], double (&b)[3][kMost], int k) {
-    for (int i = 0; i < k; ++i)
-        for (int j = 0; j <= i; ++j) {
-            double sum = a[i][j];
-            for (int l = 0; l < j; ++l) sum -= a[i][l] * a[j][l];
-            a[i][j] = i == j ? std::sqrt(sum) : sum / a[j][j];
-        }
-    for (auto& x : b) {
-        for (int i = 0; i < k; ++i) {
-            for (int l = 0; l < i; ++l) x[i] -= a[i][l] * x[l];
-            x[i] /= a[i][i];
-        }
-        for (int i = k; i-- > 0;) {
-            for (int l = i + 1; l < k; ++l) x[i] -= a[l][i] * x[l];
-            x[i] /= a[i][i];
-        }
-    }
-}
-
-// What the looks say of one vertex.
-class Vertex {
-  public:
-    Vertex(const double* position, double side, int coefficients, float* sh) : p_(position), side_(side), k_(coefficients), sh_(sh) {}
-
-    int free = 0, on = 0;
-
-    void look(const Look& look, const Verdict& verdict) {
-        double d[3], c[3];
-        for (int a = 0; a < 3; ++a) d[a] = p_[a] - look.position[a];
-        for (int a = 0; a < 3; ++a) c[a] = look.rotation[3 * a] * d[0] + look.rotation[3 * a + 1] * d[1] + look.rotation[3 * a + 2] * d[2];
-        if (!(c[2] > 0)) return;
-        const double x = look.fx * c[0] / c[2] + look.cx, y = look.fy * c[1] / c[2] + look.cy;
-        if (!(x >= 0 && x < double(look.width) && y >= 0 && y < double(look.height))) return;
-        const int64_t pixel = int64_t(y) * look.width + int64_t(x);
-        const double there = look.distance[pixel], far = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
-        const double beyond = (far - there) / side_;
-        free += look.opacity[pixel] <= verdict.nothing || (there > 0 && beyond < -verdict.before);
-        if (!(there > 0) || std::abs(beyond) >= verdict.reach) return;
-        ++on;
-        add(d, far, std::exp(-beyond * beyond), look.rgb + 3 * pixel);
-    }
-
-    // Corrects the coefficients; `keep` holds back the higher ones, as so many looks of weight 1 would that miss nothing.
-    void correct(double keep) {
-        if (!on) return;
-        for (int i = 0; i < k_; ++i) a_[i][i] += i ? keep : 1e-9;
-        solve(a_, b_, k_);
-        for (int channel = 0; channel < 3; ++channel)
-            for (int i = 0; i < k_; ++i) sh_[k_ * channel + i] += float(b_[channel][i]);
-    }
-
-  private:
-    void add(const double* d, double far, double weight, const float* rgb) {
-        constexpr double c0 = 0.28209479177387814, c1 = 0.4886025119029199;
-        const double basis[kMost] = {c0, -c1 * d[1] / far, c1 * d[2] / far, -c1 * d[0] / far};
-        for (int i = 0; i < k_; ++i)
-            for (int j = 0; j <= i; ++j) a_[i][j] += weight * basis[i] * basis[j];
-        for (int channel = 0; channel < 3; ++channel) {
-            double missed = rgb[channel] - 0.5;
-            for (int i = 0; i < k_; ++i) missed -= basis[i] * sh_[k_ * channel + i];
-            for (int i = 0; i < k_; ++i) b_[channel][i] += weight * basis[i] * missed;
-        }
-    }
-
-    const double* p_;
-    double side_;
-    int k_;
-    float* sh_;
-    double a_[kMost][kMost] = {}, b_[3][kMost] = {};
-};
-
 }  // namespace
 
 void fill_cells(const GaussianAxes& gaussians, const double* half, const int64_t* steps, const int64_t* level, const double* origin,
@@ -152,6 +80,33 @@ void fill_cells(const GaussianAxes& gaussians, const double* half, const int64_t
     }
 }
 
+std::vector<int64_t> distinct_codes(const int64_t* codes, int64_t n) {
+    constexpr int64_t kWorthwhile = 1 << 14;
+    const int64_t parts = std::clamp<int64_t>(n / kWorthwhile, 1, get_threads());
+    std::vector<std::vector<int64_t>> sorted(static_cast<std::size_t>(parts));
+    parallel_for(int(parts), [&](int part, int) {
+        auto& mine = sorted[std::size_t(part)];
+        mine.assign(codes + n * part / parts, codes + n * (part + 1) / parts);
+        std::sort(mine.begin(), mine.end());
+        mine.erase(std::unique(mine.begin(), mine.end()), mine.end());
+    });
+    while (sorted.size() > 1) {
+        std::vector<std::vector<int64_t>> merged((sorted.size() + 1) / 2);
+        parallel_for(int(merged.size()), [&](int i, int) {
+            auto &one = sorted[2 * std::size_t(i)], &to = merged[std::size_t(i)];
+            if (2 * std::size_t(i) + 1 == sorted.size()) {
+                to = std::move(one);
+                return;
+            }
+            const auto& other = sorted[2 * std::size_t(i) + 1];
+            to.reserve(one.size() + other.size());
+            std::set_union(one.begin(), one.end(), other.begin(), other.end(), std::back_inserter(to));
+        });
+        sorted = std::move(merged);
+    }
+    return std::move(sorted[0]);
+}
+
 void weigh_cells(const Masks& octree, const GaussianAxes& gaussians, const double* squares, const double* thickness, double blur,
                  const double* origin, double size, const int64_t* gaussian, const int64_t* level, const int64_t* code, int64_t m,
                  int64_t* leaf, double* weight) {
@@ -171,20 +126,6 @@ void weigh_cells(const Masks& octree, const GaussianAxes& gaussians, const doubl
             }
             leaf[i] = leaf_at(octree, level[i], code[i]);
             weight[i] = thickness[g] / std::sqrt(kTurn * narrowest) * std::exp(-0.5 * exponent);
-        }
-    });
-}
-
-void look_at_vertices(const std::vector<Look>& looks, const Verdict& verdict, const double* positions, const double* side, int64_t n,
-                      int coefficients, int16_t* free, int16_t* on, float* sh) {
-    constexpr int64_t kChunk = 1024;
-    parallel_for(int((n + kChunk - 1) / kChunk), [&](int chunk, int) {
-        for (int64_t i = chunk * kChunk; i < std::min(n, (chunk + 1) * kChunk); ++i) {
-            Vertex vertex(positions + 3 * i, side[i], coefficients, sh + 3 * coefficients * i);
-            for (const Look& look : looks) vertex.look(look, verdict);
-            vertex.correct(verdict.keep);
-            free[i] = int16_t(vertex.free);
-            on[i] = int16_t(vertex.on);
         }
     });
 }

@@ -18,6 +18,9 @@ struct GaussianAxes {
 void fill_cells(const GaussianAxes& gaussians, const double* half, const int64_t* steps, const int64_t* level, const double* origin,
                 std::vector<int64_t>& gaussian, std::vector<int64_t>& code);
 
+// The different ones of n codes, rising.
+std::vector<int64_t> distinct_codes(const int64_t* codes, int64_t n);
+
 // Child masks of an octree and where the children of each node begin.
 struct Masks {
     const uint8_t *node, *leaf;
@@ -32,16 +35,16 @@ void weigh_cells(const Masks& octree, const GaussianAxes& gaussians, const doubl
                  int64_t* leaf, double* weight);
 
 // A picture of a model through a pinhole: world to camera axes row by row (x right, y down, z forward), rgb (height, width, 3)
-// without any background, opacity and median distance (height, width).
+// without any background, and median distance (height, width): 0 where there is none, infinite where there is nothing.
 struct Look {
-    const float *rgb, *opacity, *distance;
+    const float *rgb, *distance;
     int64_t height, width;
     double rotation[9], position[3], fx, fy, cx, cy;
 };
 
 // When a vertex lies on a surface, in the free or neither; see nerfvol/starts/surfaces.py.
 struct Verdict {
-    double reach, before, nothing, keep;
+    double reach, before, keep;
 };
 
 // For each of n vertices, positions (n, 3) and sides (n): free and on (n), how many looks say so; sh (n, 3, coefficients), 1 or 4

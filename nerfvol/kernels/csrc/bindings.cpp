@@ -100,10 +100,10 @@ void py_render(const TreeArrays& t, Rows origins, Rows directions, std::vector<f
 
 // Directions of a camera's rays (square rows, square columns, 4, 3, 64); outputs are pictures (height, width[, 3]).
 void py_render_view(const TreeArrays& t, In<float, nb::shape<-1, -1, 4, 3, 64>> directions, std::vector<float> rotation,
-                    std::vector<float> origin, int64_t height, int64_t width, std::vector<float> background, float eps,
+                    std::vector<float> origin, int64_t height, int64_t width, float small, std::vector<float> background, float eps,
                     Maybe<Out<float, nb::ndim<3>>> rgb, Maybe<FloatRows> trans, Maybe<FloatRows> depth, Maybe<FloatRows> median,
                     Maybe<Out<float, nb::ndim<3>>> normal) {
-    View view{directions.data(), int64_t(directions.shape(0)), int64_t(directions.shape(1)), height, width, {}, {}};
+    View view{directions.data(), int64_t(directions.shape(0)), int64_t(directions.shape(1)), height, width, {}, {}, small};
     const auto covers = [](int64_t squares, int64_t pixels) { return squares * kSquare >= pixels && (squares - 1) * kSquare < pixels; };
     if (!covers(view.square_rows, height) || !covers(view.square_columns, width))
         throw std::invalid_argument("the directions do not cover the picture in squares of 16x16 pixels");
@@ -318,8 +318,8 @@ NB_MODULE(_nerfvol_kernels, m) {
     m.def("render", &py_render, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(),
           "trans"_a.none(), "depth"_a.none(), "median_depth"_a.none(), "normal"_a.none());
     m.def("render_view", &py_render_view, "tree"_a, "directions"_a, "rotation"_a, "origin"_a, "height"_a, "width"_a,
-          "background"_a, "early_stop_eps"_a, "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "median_depth"_a.none(),
-          "normal"_a.none());
+          "small"_a, "background"_a, "early_stop_eps"_a, "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(),
+          "median_depth"_a.none(), "normal"_a.none());
     m.def("render_backward", &py_render_backward, "tree"_a, "rays_o"_a, "rays_d"_a, "background"_a, "early_stop_eps"_a,
           "rgb"_a.none(), "trans"_a.none(), "depth"_a.none(), "gradient"_a, "slots"_a);
     bind_training(m);

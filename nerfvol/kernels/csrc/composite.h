@@ -53,7 +53,7 @@ struct Extinction {
     }
 };
 
-// The segments of one packet, delivered leaf by leaf: sink(leaf, hits, segments, field), the hits as bits and the segments by
+// The segments of one packet, delivered leaf by leaf: sink(leaf, hits, segments, cell), the hits as bits and the segments by
 // strip. Leaves wait in a queue while their memory arrives: the walk asks for a leaf's corners, kRows leaves later the corners
 // are read and their rows asked for, kAhead leaves later it is used. Returns how many leaves were tested against the rays.
 template <int B, int S, class Sink> int64_t march(const Tree& tree, const Packet<S>& p, Sink&& sink) {
@@ -88,7 +88,7 @@ template <int B, int S, class Sink> int64_t march(const Tree& tree, const Packet
         }
         if (!some) continue;
         const Cell c = cell(tree, leaf.index);
-        sink(leaf, hits, segments, LeafField<B>(c.values, c.corners));
+        sink(leaf, hits, segments, c);
     }
 }
 

@@ -1,4 +1,4 @@
-// Results are of each cell and each family alone, so that they do not depend on the number of threads.
+// Results are of each cell, family or sum alone, so that they do not depend on the number of threads.
 #include "distil.h"
 
 #include <algorithm>
@@ -118,13 +118,37 @@ void merge_errors(const VertexRows& rows, const int32_t* corners, const int64_t*
     });
 }
 
+namespace {
+
+// One thread has a range of the sums and goes through everything for it: the order is the same for any number of threads.
+template <class Task> void for_ranges(int64_t n, Task&& task) {
+    const int parts = get_threads();
+    parallel_for(parts, [&](int part, int) { task(n * part / parts, n * (part + 1) / parts); });
+}
+
+void add_row(const double* row, int64_t width, double weight, double* sum) {
+    for (int64_t k = 0; k < width; ++k) sum[k] += weight * row[k];
+}
+
+}  // namespace
+
 void add_rows(const double* rows, int64_t width, const int64_t* from, const double* weight, const int64_t* to, int64_t m,
-              double* sums) {
-    for (int64_t i = 0; i < m; ++i) {
-        const double w = weight[i], *row = rows + width * from[i];
-        double* sum = sums + width * to[i];
-        for (int64_t k = 0; k < width; ++k) sum[k] += w * row[k];
-    }
+              double* sums, int64_t n) {
+    for_ranges(n, [&](int64_t low, int64_t high) {
+        for (int64_t i = 0; i < m; ++i)
+            if (to[i] >= low && to[i] < high) add_row(rows + width * from[i], width, weight[i], sums + width * to[i]);
+    });
+}
+
+void add_to_corners(const double* rows, int64_t width, const double* weight, const int32_t* corners, int64_t m, double* sums,
+                    int64_t n) {
+    for_ranges(n, [&](int64_t low, int64_t high) {
+        for (int64_t i = 0; i < m; ++i)
+            for (int o = 0; o < 8; ++o) {
+                const int64_t to = corners[8 * i + o];
+                if (to >= low && to < high) add_row(rows + width * i, width, weight[i], sums + width * to);
+            }
+    });
 }
 
 }  // namespace nerfvol

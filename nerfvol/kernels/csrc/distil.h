@@ -26,8 +26,13 @@ struct VertexRows {
 void merge_errors(const VertexRows& rows, const int32_t* corners, const int64_t* first, const float* scale, int64_t m,
                   float* error);
 
-// Adds weight[i] times row from[i] of rows (any, width) to row to[i] of sums (any, width), for i = 0 .. m - 1 in this order.
+// Adds weight[i] times row from[i] of rows (any, width) to row to[i] of sums (n, width), for i = 0 .. m - 1 in this order; none
+// where to[i] is negative.
 void add_rows(const double* rows, int64_t width, const int64_t* from, const double* weight, const int64_t* to, int64_t m,
-              double* sums);
+              double* sums, int64_t n);
+
+// Adds weight[i] times row i of rows (m, width) to the rows of sums (n, width) that corners (m, 8) names, leaf by leaf.
+void add_to_corners(const double* rows, int64_t width, const double* weight, const int32_t* corners, int64_t m, double* sums,
+                    int64_t n);
 
 }  // namespace nerfvol

@@ -36,10 +36,20 @@ void py_add_rows(In<double, nb::ndim<2>> rows, In<int64_t, nb::ndim<1>> from, In
     require(int64_t(weight.shape(0)) == m && int64_t(to.shape(0)) == m && int64_t(sums.shape(1)) == width,
             "the arrays do not fit one another");
     for (int64_t i = 0; i < m; ++i)
-        require(from.data()[i] >= 0 && from.data()[i] < int64_t(rows.shape(0)) && to.data()[i] >= 0 &&
-                    to.data()[i] < int64_t(sums.shape(0)), "a row lies outside the array");
+        require(from.data()[i] >= 0 && from.data()[i] < int64_t(rows.shape(0)) && to.data()[i] < int64_t(sums.shape(0)),
+                "a row lies outside the array");
     nb::gil_scoped_release release;
-    add_rows(rows.data(), width, from.data(), weight.data(), to.data(), m, sums.data());
+    add_rows(rows.data(), width, from.data(), weight.data(), to.data(), m, sums.data(), int64_t(sums.shape(0)));
+}
+
+void py_add_to_corners(In<double, nb::ndim<2>> rows, In<double, nb::ndim<1>> weight, In<int32_t, nb::shape<-1, 8>> corners,
+                       Out<double, nb::ndim<2>> sums) {
+    const int64_t m = int64_t(rows.shape(0)), n = int64_t(sums.shape(0)), width = int64_t(rows.shape(1));
+    require(int64_t(weight.shape(0)) == m && int64_t(corners.shape(0)) == m && int64_t(sums.shape(1)) == width,
+            "the arrays do not fit one another");
+    for (int64_t i = 0; i < 8 * m; ++i) require(corners.data()[i] >= 0 && corners.data()[i] < n, "a corner lies outside the vertices");
+    nb::gil_scoped_release release;
+    add_to_corners(rows.data(), width, weight.data(), corners.data(), m, sums.data(), n);
 }
 
 }  // namespace
@@ -49,4 +59,5 @@ void bind_distilling(nb::module_& m) {
     m.def("merge_errors", &py_merge_errors, nb::kw_only(), "values"_a, "density"_a, "slots"_a, "bounds"_a, "corners"_a, "first"_a,
           "scale"_a, "error"_a);
     m.def("add_rows", &py_add_rows, "rows"_a, "from"_a, "weight"_a, "to"_a, "sums"_a);
+    m.def("add_to_corners", &py_add_to_corners, "rows"_a, "weight"_a, "corners"_a, "sums"_a);
 }

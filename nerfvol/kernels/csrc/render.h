@@ -1,14 +1,12 @@
 // Forward rendering of packets: colour, transmittance, expected and median distance, normals.
 #pragma once
-#include "composite.h"
+#include "collect.h"
 #include "pool.h"
 
 namespace NERFVOL_ISA {
 
 using nerfvol::kSquare;
 using nerfvol::Rays;
-using nerfvol::RenderOptions;
-using nerfvol::RenderOutput;
 using nerfvol::View;
 
 // Loads up to 64 rays from index `first` that share their origin; returns how many.
@@ -50,74 +48,6 @@ inline void load_square(const Tree& tree, const View& view, int64_t row, int64_t
     bound_packet(p);
 }
 
-// Hits that wait to be composited, front to back: extinction is expensive and worked out for sixteen at a time, while a leaf
-// is met by three rays on average. A ray that ends leaves a few hits behind here, which are dropped.
-struct Waiting {
-    static constexpr int kCapacity = 2 * kTile;  // small, to stay in the core's nearest cache
-    int first = 0, end = 0;
-    int32_t lane[kCapacity];
-    f4 value[kCapacity];                   // r, g, b, distance
-    float raw[kCapacity + 16], length[kCapacity + 16];  // read sixteen at a time, a few beyond the end
-    float slope[kCapacity][3];             // of the raw density, for normals
-
-    int size() const { return end - first; }
-
-    // Makes room for a strip's hits behind those that wait.
-    void make_room(bool with_slopes) {
-        if (end + kTile <= kCapacity) return;
-        const auto forward = [&](auto* rows) { std::memmove(rows, rows + first, size() * sizeof(*rows)); };
-        forward(lane); forward(value); forward(raw); forward(length);
-        if (with_slopes) forward(slope);
-        end -= first;
-        first = 0;
-    }
-};
-
-// What a packet's rays gather besides colour.
-template <int S> struct Extras {
-    float median[S * kTile] = {}, normal[S * kTile][3] = {};
-};
-
-inline void add_normal(const float* slope, float w, float* normal) {
-    const float norm = std::sqrt(dot3(slope, slope));
-    if (norm > 1e-12f)
-        for (int k = 0; k < 3; ++k) normal[k] -= w * slope[k] / norm;
-}
-
-// Distance at which the transmittance falls to 1/2 inside a segment that starts with more and ends with less.
-inline float median_distance(float before, float raw, float length, float middle, float density_scale) {
-    const float tau = length * density_scale * (raw < 1.0f ? std::exp(raw - 1.0f) : raw);
-    const float f = tau > 0 ? std::log(2.0f * before) / tau : 0.0f;
-    return middle + (f - 0.5f) * length;
-}
-
-// Composites the first `m` <= 64 of the hits that wait.
-template <int S>
-void composite(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, Waiting& waiting, int m,
-               PacketState<S>& state, Extras<S>& extras) {
-    Extinction x;
-    x.evaluate(waiting.raw + waiting.first, waiting.length + waiting.first, m, tree.density_scale, false);
-    const bool with_median = out.median_depth, with_normal = out.normal;
-    bool some_end = false;
-    for (int i = 0, j = waiting.first; i < m; ++i, ++j) {
-        const int l = waiting.lane[j];
-        uint64_t& alive = p.strips[l / kTile].alive;
-        if (!(alive >> l % kTile & 1)) continue;
-        const float before = state.trans[l], after = before * x.through[i], w = before * x.alpha[i];
-        state.colour[l] += w * waiting.value[j];
-        state.trans[l] = after;
-        if (with_median && before > 0.5f && after <= 0.5f)
-            extras.median[l] = median_distance(before, waiting.raw[j], waiting.length[j], waiting.value[j][3], tree.density_scale);
-        if (with_normal) add_normal(waiting.slope[j], w, extras.normal[l]);
-        if (after < options.early_stop_eps) {
-            alive &= ~(1ull << l % kTile);
-            some_end = true;
-        }
-    }
-    if (some_end) p.find_alive();
-    waiting.first += m;
-}
-
 // Where lane `lane` of strip `strip` lies in its packet's 8x8 tile or 16x16 square.
 template <int S> int row_of(int strip, int lane) { return S == 1 ? lane / 8 : 4 * strip + lane / 32 * 2 + lane / 2 % 2; }
 template <int S> int column_of(int lane) { return S == 1 ? lane % 8 : lane / 4 % 8 * 2 + lane % 2; }
@@ -146,38 +76,35 @@ void write_window(const Window& to, const PacketState<S>& state, const Extras<S>
     }
 }
 
+// small: cells whose side is below so many times their distance are shaded along the ray to their middle, from which the
+// directions of all rays that meet them differ by sqrt(3)/2 of that at most.
 template <int B, int S>
-void render_packet(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, const Window& to) {
+void render_packet(const Tree& tree, Packet<S>& p, const RenderOptions& options, const RenderOutput& out, const Window& to, float small) {
     BasisRows<B> basis[S];
-    bool has_basis[S] = {};                // many strips of a picture meet nothing
-    PacketState<S> state;
-    Waiting waiting;
-    Extras<S> extras;
-    march<B>(tree, p, [&](const Leaf&, const uint64_t* hits, const Segments* segments, const LeafField<B>& field) {
-        for (int s = 0; s < S; ++s) {
-            if (!hits[s]) continue;
-            const Segments& at = segments[s];
-            if (!has_basis[s]) basis[s].fill(p.strips[s], tree.sh_degree);
-            has_basis[s] = true;
-            waiting.make_room(out.normal);
-            int i = waiting.end;
-            for (uint64_t h = hits[s]; h; h &= h - 1, ++i) {
-                const int l = __builtin_ctzll(h);
-                f4 value = field.at(at.fx[l], at.fy[l], at.fz[l], basis[s].row[l]);
-                waiting.lane[i] = s * kTile + l;
-                waiting.raw[i] = value[3];
-                value += 0.5f;
-                value[3] = at.middle[l] * tree.size;
-                waiting.value[i] = value;
-                waiting.length[i] = at.length[l] * tree.size;
-                if (out.normal) field.density_slope(at.fx[l], at.fy[l], at.fz[l], waiting.slope[i]);
-            }
-            waiting.end = i;
-            if (waiting.size() >= 16) composite(tree, p, options, out, waiting, std::min(waiting.size() & ~15, kTile), state, extras);
+    bool has_basis[S] = {};                // many strips of a picture meet nothing, or nothing near
+    Collector<S> found{tree, p, options, out, {}, {}, {}};
+    const float* o = p.pyramid.o;
+    march<B>(tree, p, [&](const Leaf& leaf, const uint64_t* hits, const Segments* segments, const Cell& c) {
+        const float h = 0.5f * leaf.side, towards[3] = {leaf.x + h - o[0], leaf.y + h - o[1], leaf.z + h - o[2]};
+        const auto slope_of = [](const auto& field) {
+            return [&field](float x, float y, float z, float* g) { field.density_slope(x, y, z, g); };
+        };
+        if (leaf.side * leaf.side < small * small * dot3(towards, towards)) {
+            const SmallLeafField<B> field(c.values, c.corners, tree.sh_degree, towards);
+            found.collect(hits, segments, [&](float x, float y, float z, int, int) { return field.at(x, y, z); }, slope_of(field));
+            return;
         }
+        for (int s = 0; s < S; ++s) {
+            if (!hits[s] || has_basis[s]) continue;
+            basis[s].fill(p.strips[s], tree.sh_degree);
+            has_basis[s] = true;
+        }
+        const LeafField<B> field(c.values, c.corners);
+        found.collect(hits, segments, [&](float x, float y, float z, int s, int l) { return field.at(x, y, z, basis[s].row[l]); },
+                      slope_of(field));
     });
-    composite(tree, p, options, out, waiting, waiting.size(), state, extras);
-    write_window(to, state, extras, options, out);
+    found.composite_first(found.waiting.size());
+    write_window(to, found.state, found.extras, options, out);
 }
 
 template <int B> void render_rays(const Tree& tree, const Rays& rays, const RenderOptions& options, const RenderOutput& out) {
@@ -188,7 +115,7 @@ template <int B> void render_rays(const Tree& tree, const Rays& rays, const Rend
             const int64_t end = std::min<int64_t>((t + 1) * kTile, rays.n);
             for (int64_t first = t * kTile; first < end;) {
                 const int n = load_packet(tree, rays, first, end, p);
-                render_packet<B>(tree, p, options, out, {first, 8, 8, 8, n});
+                render_packet<B>(tree, p, options, out, {first, 8, 8, 8, n}, 0);
                 first += n;
             }
         }
@@ -205,7 +132,8 @@ template <int B> void render_squares(const Tree& tree, const View& view, const R
             if (row >= view.square_rows || column >= view.square_columns) continue;
             load_square(tree, view, row, column, p);
             const int64_t first = row * kSquare * view.width + column * kSquare;
-            render_packet<B>(tree, p, options, out, {first, view.width, view.height - row * kSquare, view.width - column * kSquare});
+            render_packet<B>(tree, p, options, out, {first, view.width, view.height - row * kSquare, view.width - column * kSquare},
+                             view.small);
         }
     });
 }

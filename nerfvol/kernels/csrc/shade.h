@@ -98,6 +98,49 @@ template <int B> struct LeafField {
     }
 };
 
+// The field of a cell that is small, seen from the rays' origin: its harmonics along the ray through its middle serve all rays
+// that meet it, so that only (r, g, b, raw density) is left to be interpolated; rgb without the constant 1/2.
+template <int B> struct SmallLeafField {
+    f4 c[8];
+
+    // towards: from the origin to the cell's middle, of any length.
+    SmallLeafField(const RowNumber* values, const int32_t* corners, int degree, const float* towards) {
+        const float inverse = 1.0f / std::sqrt(dot3(towards, towards));
+        float b[16] = {};
+        sh_basis(degree, inverse * towards[0], inverse * towards[1], inverse * towards[2], b);
+        f16 basis[B];
+        for (int k = 0; k < B; ++k) {
+            const f4 four = load<f4>(b + 4 * k);
+            basis[k] = join(four, four, four, f4{k == 0 ? 1.0f : 0.0f, 0, 0, 0});
+        }
+        const f4 ninth = {b[8], b[8], b[8], 0};
+        for (int o = 0; o < 8; ++o) {
+            f16 terms{}, row;
+            for (int k = 0; k < B; ++k) {
+                read_row(values + 16 * (B * int64_t(corners[o]) + k), row);
+                terms += row * basis[k];
+            }
+            c[o] = quad_sums(terms);
+            if (B == 2) c[o] += ninth * quarter<3>(row);
+        }
+        for (int axis = 1; axis < 8; axis *= 2)
+            for (int o = 0; o < 8; ++o)
+                if (o & axis) c[o] -= c[o ^ axis];
+    }
+
+    f4 at(float x, float y, float z) const {
+        const f4 front = (c[0] + z * c[1]) + y * (c[2] + z * c[3]), back = (c[4] + z * c[5]) + y * (c[6] + z * c[7]);
+        return front + x * back;
+    }
+
+    // d(raw density)/d(x, y, z) at a point.
+    void density_slope(float x, float y, float z, float* g) const {
+        g[0] = c[4][3] + z * c[5][3] + y * (c[6][3] + z * c[7][3]);
+        g[1] = c[2][3] + z * c[3][3] + x * (c[6][3] + z * c[7][3]);
+        g[2] = c[1][3] + y * c[3][3] + x * (c[5][3] + y * c[7][3]);
+    }
+};
+
 // sigma / density_scale: exponential below 1, linear above (value and slope are continuous).
 inline f16 explin(const f16& raw) { return select_less(raw, 1.0f, vexp(raw - 1.0f), raw); }
 inline f16 explin_slope(const f16& raw) { return select_less(raw, 1.0f, vexp(raw - 1.0f), splat16(1.0f)); }

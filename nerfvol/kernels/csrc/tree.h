@@ -41,6 +41,7 @@ struct View {
     const float* directions;                     // (square rows, square columns, 4, 3, 64) unit length
     int64_t square_rows, square_columns, height, width;
     float rotation[9], origin[3];                // camera to world, row by row; scene units
+    float small = 0;                             // a cell is shaded along one ray where its side is below this many times its distance
 };
 
 struct RenderOptions {

@@ -124,6 +124,8 @@ void square_directions(int64_t row, int64_t column, float* out) {
         }
 }
 
+constexpr float kSmall = 1.0f / 64;            // as nerfvol/views.py has it
+
 template <int B> void draw_squares(int64_t row, const RenderOptions& options, const RenderOutput& out) {
     alignas(64) float directions[4 * 3 * kTile];
     View square{directions, 1, 1, 0, 0, {}, {}};
@@ -134,7 +136,8 @@ template <int B> void draw_squares(int64_t row, const RenderOptions& options, co
     for (int64_t column = 0; column < (width + 15) / 16; ++column) {
         square_directions(row, column, directions);
         load_square(octree.tree, square, 0, 0, p);
-        render_packet<B>(octree.tree, p, options, out, {row * 16 * width + column * 16, width, height - row * 16, width - column * 16});
+        render_packet<B>(octree.tree, p, options, out, {row * 16 * width + column * 16, width, height - row * 16, width - column * 16},
+                         kSmall);
     }
 }
 
