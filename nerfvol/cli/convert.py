@@ -82,13 +82,13 @@ def run(options: ConvertOptions) -> int:
     images = _images_of(options)
     if options.time_budget is not None and images is None:
         raise InputError("--time-budget trains on images: say which with --data DIR")
-    from nerfvol.datasets.load import load_cameras, load_dataset
+    from nerfvol.datasets.load import dataset_cameras, load_dataset
 
     training = None if images is None or options.time_budget is None else load_dataset(split="train", **images)
     if training is not None:
         seen = training.cameras, training.scene
     else:
-        seen = None if images is None else load_cameras(split="train", **images)
+        seen = None if images is None else dataset_cameras(split="train", **images)
     held_out = None if images is None else load_dataset(split="val", **images)
     model = _converted(options, target, seen, training, 0 if held_out is None else len(held_out))
     _write(model, options, suffix)

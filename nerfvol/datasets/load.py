@@ -99,7 +99,7 @@ def load_dataset(
     )
 
 
-def load_cameras(
+def dataset_cameras(
     path: str | os.PathLike[str],
     split: str = "train",
     downscale: int = 1,

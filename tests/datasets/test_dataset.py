@@ -8,7 +8,7 @@ import pytest
 
 from nerfvol.datasets import decoding, sampled
 from nerfvol.datasets.dataset import NEAR_SHARE, Dataset
-from nerfvol.datasets.load import load_cameras, load_dataset
+from nerfvol.datasets.load import dataset_cameras, load_dataset
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
 from tests.fixtures.scenes import random_images, ring
@@ -135,7 +135,7 @@ def test_cameras_alone_are_those_of_the_pictures_and_decode_none_of_them(tmp_pat
     write_scene(tmp_path, {"train": 30, "val": 7}, size=20)
     dataset = load_dataset(tmp_path, split, **settings)
     monkeypatch.setattr(decoding, "read_pixels", None)
-    cameras, scene = load_cameras(tmp_path, split, **settings)
+    cameras, scene = dataset_cameras(tmp_path, split, **settings)
     assert len(cameras) == len(dataset) > 1
     for camera, other in zip(cameras, dataset.cameras, strict=True):
         assert camera.intrinsics == other.intrinsics
