@@ -268,11 +268,26 @@ class Camera:
 
 def tile_pixels(width: int, height: int) -> NDArray[np.int64]:
     """Flat pixel indices (n_tiles, 64) of an image's 8x8 tiles: row by row, and so inside; -1 outside the image."""
-    columns = np.arange(math.ceil(width / TILE_SIDE) * TILE_SIDE)
-    rows = np.arange(math.ceil(height / TILE_SIDE) * TILE_SIDE)
+    columns, rows = _tiled(width), _tiled(height)
     inside = (rows[:, None] < height) & (columns[None, :] < width)
-    flat = np.where(inside, rows[:, None] * width + columns[None, :], -1).astype(np.int64)
-    blocks = flat.reshape(len(rows) // TILE_SIDE, TILE_SIDE, len(columns) // TILE_SIDE, TILE_SIDE)
+    return _in_tiles(np.where(inside, rows[:, None] * width + columns[None, :], -1))
+
+
+def tile_rays(width: int, height: int) -> NDArray[np.int64]:
+    """:func:`tile_pixels` with the image's nearest pixel outside of it: the pixels whose rays pad a tile. One that points
+    elsewhere would make a tile as wide as all that lies between, and slow as that (kernels/csrc/packet.h)."""
+    columns, rows = np.minimum(_tiled(width), width - 1), np.minimum(_tiled(height), height - 1)
+    return _in_tiles(rows[:, None] * width + columns[None, :])
+
+
+def _tiled(side: int) -> NDArray[np.int64]:
+    return np.arange(math.ceil(side / TILE_SIDE) * TILE_SIDE)
+
+
+def _in_tiles(flat: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows and columns of whole tiles as (n_tiles, 64)."""
+    rows, columns = flat.shape
+    blocks = flat.reshape(rows // TILE_SIDE, TILE_SIDE, columns // TILE_SIDE, TILE_SIDE)
     return np.ascontiguousarray(blocks.transpose(0, 2, 1, 3)).reshape(-1, TILE_SIDE * TILE_SIDE)
 
 

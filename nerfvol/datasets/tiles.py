@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from nerfvol.cameras.camera import Intrinsics, tile_pixels
+from nerfvol.cameras.camera import Intrinsics, tile_pixels, tile_rays
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError, shown
 from nerfvol.kernels.state import TILE_RAYS, Batch
@@ -67,7 +67,8 @@ class TileBank:
             intrinsics = camera.intrinsics
             flat = tile_pixels(intrinsics.width, intrinsics.height)
             if intrinsics not in tables:
-                tables[intrinsics] = intrinsics.directions().reshape(-1, 3)[np.maximum(flat, 0)]
+                rays = tile_rays(intrinsics.width, intrinsics.height)
+                tables[intrinsics] = intrinsics.directions().reshape(-1, 3)[rays]
             self._directions.append(tables[intrinsics])
             insides.append(_counting(flat, None if masks is None else masks[i]))
             image_of.append(np.full(len(flat), i, np.int32))

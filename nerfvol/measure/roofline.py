@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfvol.cameras.camera import Camera, tile_pixels
+from nerfvol.cameras.camera import Camera, tile_pixels, tile_rays
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.kernels.state import TILE_RAYS
@@ -143,14 +143,14 @@ def touched(octree: Octree, batches: Iterable[ops.Batch], pixel_angle: float) ->
 def view_batches(camera: Camera) -> Iterable[ops.Batch]:
     """All pixels of a view, a number of tiles at a time."""
     lens = camera.intrinsics
-    tiles = tile_pixels(lens.width, lens.height)
+    tiles, rays = tile_pixels(lens.width, lens.height), tile_rays(lens.width, lens.height)
     origin, directions = camera.rays()
     for first in range(0, len(tiles), FRAME_TILES):
         pixels = tiles[first : first + FRAME_TILES].reshape(-1)
         origins = np.broadcast_to(origin, (len(pixels) // TILE_RAYS, 3)).copy()
         yield ops.Batch(
             origins,
-            directions[np.maximum(pixels, 0)],
+            directions[rays[first : first + FRAME_TILES].reshape(-1)],
             np.zeros((len(pixels), 3), np.float32),
             (pixels >= 0).astype(np.float32),
         )

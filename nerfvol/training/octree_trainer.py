@@ -48,7 +48,7 @@ FEWEST_STEPS = 5000
 """Before a run with a time budget may end early, however few its tiles."""
 WORTH_PRUNING = 0.05
 """Share of the leaves below which a pruning inside a stage is left out: two octrees are in memory while one is made."""
-DRAWN_SHARE = 0.5
+DRAWN_SHARE = 0.3
 """Of a step's time: drawing its tiles."""
 MOST_LEVELS_AT_ONCE = 2
 """Where stages are left out: more would split haze that was never pruned."""

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerfvol.cameras.calibration import CAMERA_MODELS, lens_keys, read_calibration
-from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, tile_pixels
+from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, tile_pixels, tile_rays
 from nerfvol.cameras.further_lenses import FieldOfView, Rational
 from nerfvol.cameras.lens import PINHOLE as NO_DISTORTION
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
@@ -318,6 +318,7 @@ def test_tiles_hold_every_pixel_once(width, height):
         for n in (0, 7, 8, 27, 63):
             column, row = 8 * (t % per_row) + n % 8, 8 * (t // per_row) + n // 8
             assert tile[n] == (row * width + column if column < width and row < height else -1)
+            assert tile_rays(width, height)[t, n] == min(row, height - 1) * width + min(column, width - 1)
 
 
 def test_orbit_looks_at_its_middle():

@@ -179,5 +179,5 @@ def test_prunings_of_the_run_tell_what_the_last_one_takes(tiny_scene, monkeypatc
     assert trainer.octree.n_leaves == before / 2
     assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5)
     trainer.step(0.5)
-    judging = 4 * octree_trainer.FINAL_TILES * 0.5 / 16
+    judging = 4 * octree_trainer.FINAL_TILES * octree_trainer.DRAWN_SHARE / 16
     assert trainer.seconds_to_write() == pytest.approx(1.0 + 3 * 0.5 + judging)
