@@ -86,6 +86,7 @@ MUTANTS = (
     M("nerfvol/datasets/colmap_files.py", "if below and _is_features(line):", "if below:", PEOPLE, "every second line is no image"),
     M("nerfvol/datasets/tiles.py", "np.where(padding, 0, mask.reshape(-1)[np.maximum(flat, 0)])", "np.where(padding, 0, 255)", MASKS, "masked rays have weight"),
     M("nerfvol/datasets/tiles.py", "return len(self.foreground_tiles) + len(self.background_tiles)", "return len(self.image) + 1", "datasets/test_tiles.py", "the expected loss is not the mean"),
+    M("nerfvol/datasets/tiles.py", "reshape(-1, 3)[rays]", "reshape(-1, 3)[np.maximum(flat, 0)]", "datasets/test_tiles.py", "padding points at the first pixel"),
     M("nerfvol/datasets/photographs.py", "np.minimum(mask, own)[..., None]", "np.full_like(mask, 255)[..., None]", MASKS, "splats learn what is masked"),
     M("nerfvol/datasets/frame.py", "octree.size * self.scale, octree.density_scale / self.scale", "octree.size * self.scale, octree.density_scale", FAULTS, "densities in another unit"),
     M("nerfvol/datasets/fingerprint.py", 'said.append(f"{len(gone)} are gone ({named(gone)})")', "pass", FAULTS, "missing pictures are not missed"),
