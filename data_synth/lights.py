@@ -23,7 +23,7 @@ from data_synth.jit import jit, plain
 from data_synth.media import rgb
 from data_synth.rng import uniform
 from data_synth.surfaces import RELATIVE
-from data_synth.vec import add, along, cross, dot, extent, mean, scale, sphere_direction, sub
+from data_synth.vec import along, cross, dot, extent, scale, sphere_direction, sub
 
 POINT, DIRECTIONAL, QUAD, SKY, SPOT = range(5)
 WIDTH = 16
@@ -138,57 +138,6 @@ def escaped(lights, d):
 
 
 @jit
-def found_sky(lights, d, density):
-    """``escaped`` for a direction that something else draws with this density, by the balance heuristic against each sky's
-    next events; density 0: there are none."""
-    total = (0.0, 0.0, 0.0)
-    for k in range(lights.shape[0]):
-        if lights[k, 0] == SKY:
-            s, share = sky_share(lights, k, d)
-            weight = density / (density + 0.25 / math.pi * share) if density > 0.0 else 1.0
-            total = add(total, scale(weight, s))
-    return total
-
-
-@jit
-def sky_means(lights, k):
-    """Means of a sky's channels at the zenith, the horizon and the ground, and over all directions."""
-    z, h, g = mean(column3(lights, k, 4)), mean(column3(lights, k, 7)), mean(column3(lights, k, 10))
-    least = min(z, h, g)
-    return z, h, g, least + (z - least) / 3.0 + (h - least) * (19.0 / 96.0) + (g - least) * (15.0 / 32.0)
-
-
-@jit
-def sky_share(lights, k, d):
-    """(Radiance of sky k from d, its brightness as a multiple of the sky's own mean): ``sample_light`` draws d with the density
-    of that multiple over 4 pi."""
-    s = sky_blend(column3(lights, k, 4), column3(lights, k, 7), column3(lights, k, 10), d[2])
-    overall = sky_means(lights, k)[3]
-    return s, mean(s) / overall if overall > 0.0 else 0.0
-
-
-@jit
-def sky_height(lights, k, rng):
-    """d_z of a direction drawn in proportion to the brightness of sky k: exactly, for that is a sum of what its darkest colour
-    sends from everywhere and what zenith, horizon and ground send beyond it, each of whose densities has an inverse."""
-    z, h, g, overall = sky_means(lights, k)
-    least, u = min(z, h, g), uniform(rng)
-    even = least / overall if overall > 0.0 else 1.0
-    if u < even:
-        return 1.0 - 2.0 * u / even
-    v, u = uniform(rng), u * overall - least
-    if u < (z - least) / 3.0:  # sqrt(d_z)
-        return math.pow(v, 2.0 / 3.0)
-    if u < (z - least) / 3.0 + (h - least) * (19.0 / 96.0):  # 1 - sqrt(d_z), and 1 + 8 d_z down to -1/8
-        if uniform(rng) < 16.0 / 19.0:
-            root = 0.5 - math.sin(math.asin(1.0 - 2.0 * v) / 3.0)
-            return root * root
-        return 0.125 * (math.sqrt(v) - 1.0)
-    v *= 15.0 / 16.0  # min(-8 d_z, 1)
-    return -0.5 * math.sqrt(v) if v < 1.0 / 16.0 else -v - 1.0 / 16.0
-
-
-@jit
 def sample_light(lights, k, p, rng):
     """(wi, distance, radiance / pdf, pdf): a direction from p towards light k. pdf (1/sr) is 0 for beams (deltas).
 
@@ -199,11 +148,9 @@ def sample_light(lights, k, p, rng):
     if kind == DIRECTIONAL:
         return column3(lights, k, 7), math.inf, colour, 0.0
     if kind == SKY:
-        wi = sphere_direction((0.0, 0.0, 1.0), sky_height(lights, k, rng), 2.0 * math.pi * uniform(rng))
-        s, share = sky_share(lights, k, wi)
-        if share <= 0.0:
-            return wi, math.inf, (0.0, 0.0, 0.0), 1.0
-        return wi, math.inf, scale(4.0 * math.pi / share, s), 0.25 / math.pi * share
+        wi = sphere_direction((0.0, 0.0, 1.0), 1.0 - 2.0 * uniform(rng), 2.0 * math.pi * uniform(rng))
+        s = sky_blend(colour, column3(lights, k, 7), column3(lights, k, 10), wi[2])
+        return wi, math.inf, scale(4.0 * math.pi, s), 0.25 / math.pi
     q, normal, pdf_area = column3(lights, k, 7), column3(lights, k, 10), 1.0
     if kind == QUAD:
         u, v = uniform(rng), uniform(rng)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from data_synth import equiangular, materials, phase
 from data_synth.cameras import pixel_ray
 from data_synth.jit import jit, kernel
-from data_synth.lights import POINT, column3, found_sky, quad_pdf, quad_radiance, sample_light
+from data_synth.lights import POINT, column3, escaped, quad_pdf, quad_radiance, sample_light
 from data_synth.lookups import Le_at, albedo_at, attribute, box_interval, extinction, phase_at
 from data_synth.materials import DIELECTRIC
 from data_synth.parts import BLOCK
@@ -31,6 +31,7 @@ ROULETTE_DEPTH = 6
 LONG = 1000  # scatterings after which even a path that loses nothing is ended by chance
 EVENT_ROULETTE = 0.1  # throughput times f (1/sr) below which next events are drawn by chance
 SEGMENTS = 1_000_000  # only a guard: roulette ends paths long before
+SKY_PDF = 0.07957747154594767  # 1 / 4 pi
 UNKNOWN = -1.0
 
 
@@ -140,13 +141,14 @@ def found_light(w, ray, t, quad, pdf_last):
     pdf_last: density of that direction; 0 if next-event estimation could not have found the light (camera, mirrors);
     UNKNOWN if nobody knows the density, so that next-event estimation has the light to itself.
     """
+    count = w.lights.shape[0]
     if pdf_last == UNKNOWN:
         return (0.0, 0.0, 0.0)
-    density = w.lights.shape[0] * pdf_last
-    if quad < 0:
-        return found_sky(w.sky, ray[1], density)
-    light, pdf = quad_radiance(w.quads, quad, ray[1]), quad_pdf(w.quads, quad, ray, t)
-    return scale(density / (density + pdf) if pdf_last > 0.0 else 1.0, light)
+    if quad >= 0:
+        light, pdf = quad_radiance(w.quads, quad, ray[1]), quad_pdf(w.quads, quad, ray, t)
+    else:
+        light, pdf = escaped(w.sky, ray[1]), SKY_PDF
+    return scale(count * pdf_last / (count * pdf_last + pdf) if pdf_last > 0.0 else 1.0, light)
 
 
 @jit

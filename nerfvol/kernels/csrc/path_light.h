@@ -55,8 +55,6 @@ inline f4 scattered(const Medium& m, f4 before, Random& random) {
 struct Light {
     int kind;
     f4 colour, a, b;  // point: position in u from the medium's lower corner; directional: towards it; sky: horizon, ground
-    float even, zenith, horizon;                              // of a sky: chances that height() takes these parts
-    float density;                                            // of a direction towards it, 1/sr over the mean of its radiance
 };
 
 struct Lights {
@@ -66,27 +64,16 @@ struct Lights {
     Lights(const PathScene& s) {
         for (int k = 0; k < s.n_lights; ++k) {
             const double* row = s.lights + k * kLightColumns;
-            Light l{int(row[0]), vector3(row + 4), vector3(row + 7), vector3(row + 10), 1.0f, 0.0f, 0.0f, 0.0f};
+            Light l{int(row[0]), vector3(row + 4), vector3(row + 7), vector3(row + 10)};
             if (l.kind == kPointLight) {
                 for (int c = 0; c < 3; ++c) l.a[c] = float(row[7 + c] - s.medium.lo[c]);
                 points.push_back(k);
             }
-            if (l.kind == kSkyLight) sky = true, measure(l);
+            sky = sky || l.kind == kSkyLight;
             rows.push_back(l);
         }
     }
     int count() const { return int(rows.size()); }
-
-  private:
-    // lights.sky_means
-    static void measure(Light& l) {
-        const float z = mean3(l.colour), h = mean3(l.a), g = mean3(l.b), least = std::fmin(z, std::fmin(h, g));
-        const float zenith = (z - least) * (1.0f / 3.0f), horizon = (h - least) * (19.0f / 96.0f);
-        const float overall = least + zenith + horizon + (g - least) * (15.0f / 32.0f);
-        if (!(overall > 0.0f)) return;
-        l.even = least / overall, l.zenith = zenith / overall, l.horizon = horizon / overall;
-        l.density = kQuarter / overall;
-    }
 };
 
 inline int choose(int n, Random& random) {
@@ -101,28 +88,10 @@ inline f4 sky_towards(const Light& l, f4 d) {
     return l.a + (t < 1.0f ? t : 1.0f) * (l.b - l.a);
 }
 
-// lights.sky_height: the cosine from the zenith of a direction drawn in proportion to the mean of a sky's channels.
-inline float height(const Light& l, float u, Random& random) {
-    if (u < l.even) return 1.0f - 2.0f * (u / l.even);
-    float v = random.uniform();
-    u -= l.even;
-    if (u < l.zenith) return sqr(std::cbrt(v));
-    if (u < l.zenith + l.horizon) {
-        if (random.uniform() < 16.0f / 19.0f) return sqr(0.5f - std::sin(std::asin(1.0f - 2.0f * v) * (1.0f / 3.0f)));
-        return 0.125f * (std::sqrt(v) - 1.0f);
-    }
-    v *= 15.0f / 16.0f;
-    return v < 1.0f / 16.0f ? -0.5f * std::sqrt(v) : -v - 1.0f / 16.0f;
-}
-
-// Radiance of all skies from d that something else draws with this density: by the balance heuristic, 0: the whole of it.
-inline f4 found_sky(const Lights& lights, f4 d, float density) {
+inline f4 all_sky(const Lights& lights, f4 d) {
     f4 total = splat4(0.0f);
-    for (const Light& l : lights.rows) {
-        if (l.kind != kSkyLight) continue;
-        const f4 s = sky_towards(l, d);
-        total += (density > 0.0f ? density / (density + l.density * mean3(s)) : 1.0f) * s;
-    }
+    for (const Light& l : lights.rows)
+        if (l.kind == kSkyLight) total += sky_towards(l, d);
     return total;
 }
 

@@ -78,12 +78,11 @@ template <int kKind, bool kGrey> struct Tracer {
         const int count = lights.count();
         const Light& l = lights.rows[size_t(choose(count, random))];
         f4 wi = l.a, radiance = l.colour;
-        float distance = INFINITY, weight = float(count), pdf = 0.0f;
+        float distance = INFINITY, weight = float(count);
         if (l.kind == kSkyLight) {
             const uint64_t bits = random.bits();
-            wi = about(f4{0.0f, 0.0f, 1.0f, 0.0f}, height(l, Random::unit(uint32_t(bits >> 32)), random), Random::unit(uint32_t(bits)));
-            radiance = sky_towards(l, wi);
-            pdf = l.density * mean3(radiance);
+            wi = about(f4{0.0f, 0.0f, 1.0f, 0.0f}, 1.0f - 2.0f * Random::unit(uint32_t(bits >> 32)), Random::unit(uint32_t(bits)));
+            radiance = (1.0f / kQuarter) * sky_towards(l, wi);
         } else if (l.kind == kPointLight) {
             const f4 to = l.a - m.world(w);
             const float r2 = dot3(to, to);
@@ -95,7 +94,7 @@ template <int kKind, bool kGrey> struct Tracer {
             weight *= own_share(sigma, Equiangular(m.world(reached.w), reached.d, t1, l.a).density(t), lights);
         }
         const float f = phase_function(m, reached.d, wi);
-        if (pdf > 0.0f) weight /= pdf + float(count) * f;         // the balance heuristic's pdf / (...), over pdf
+        if (l.kind == kSkyLight) weight *= kQuarter / (kQuarter + float(count) * f);
         const f4 contribution = (weight * f) * beta * radiance;
         if (!(largest(contribution) > 0.0f)) return splat4(0.0f);
         const float q = largest(beta) * f * (1.0f / kEventRoulette);
@@ -147,7 +146,8 @@ template <int kKind, bool kGrey> struct Tracer {
                 if (straight && !opaque_sky) {
                     alpha = 1.0 - double(mean3(beta));
                 } else {
-                    L += beta * found_sky(lights, d, float(lights.count()) * pdf);
+                    const float n = float(lights.count()) * pdf;
+                    L += (pdf > 0.0f ? n / (n + kQuarter) : 1.0f) * beta * all_sky(lights, d);
                 }
                 break;
             }
@@ -204,7 +204,7 @@ template <class T> void add_path(const T& tracer, const PathScene& s, int width,
         for (int a = 0; a < 3; ++a) w[a] = (o[a] + t.first * d[a] - s.medium.lo[a]) / s.medium.brick_size[a];
         r = tracer.trace(vector3(w), direction, t.first, random);
     } else if (s.settings.opaque_sky) {
-        r.L = found_sky(tracer.lights, direction, 0.0f);
+        r.L = all_sky(tracer.lights, direction);
     }
     for (int a = 0; a < 3; ++a) sums[a] += r.L[a], sums[5 + a] += double(r.L[a]) * r.L[a];
     sums[3] += r.alpha;
