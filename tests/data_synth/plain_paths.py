@@ -16,7 +16,7 @@ from data_synth.materials import albedo_at, refracted
 from data_synth.rng import new_rng
 from data_synth.scene import Scene
 from data_synth.world import inside_at, number_at
-from tests.fixtures.hypothesis_tests import assert_means
+from tests.fixtures.hypothesis_tests import assert_histogram, assert_means
 
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered")  # of uint64, which is meant to wrap
 SKY = np.array([0.7, 0.4, 0.2])
@@ -107,6 +107,26 @@ def test_a_sky_of_three_colours():
     blends = [sky_blend(zenith, horizon, ground, z) for z in (1.0, 0.25, 0.0, -0.0625, -0.125, -1.0)]
     middle = [tuple(0.5 * (x + y) for x, y in zip(a, horizon, strict=True)) for a in (zenith, ground)]
     assert np.allclose(blends, [zenith, middle[0], horizon, middle[1], ground, ground])
+
+
+@pytest.mark.parametrize("colours", [(1.0, 0.0, 0.0), (0.1, (0.9, 0.5, 0.2), 0.0)])
+def test_a_matt_floor_under_two_skies(colours):
+    """albedo / pi times the integral of (h + sqrt(z) (top - h)) z over the upper half: h + 4/5 (top - h), of both skies."""
+    top, h = (np.broadcast_to(c, 3) for c in colours[:2])
+    scene = Scene(lights=[lights.sky(*colours), lights.environment(0.3)], **FLOOR)
+    rgb, variance = seen(scene, pixel((0.5, -0.2, 0.5), (0, 0, 0)), spp=3000, max_depth=1)
+    assert_means(rgb, variance, np.array([0.9, 0.5, 0.2]) * (h + 0.8 * (top - h) + 0.3))
+
+
+def test_directions_to_a_sky_are_even():
+    """d_z and azimuth are even, whatever the sky: the density is 1 / 4 pi, as the balance heuristic takes it to be."""
+    row, rng, n = lights.sky((0.1, 0.2, 0.9), 0.8, 0.0)[None], new_rng(3, 5), 4000
+    drawn = [sample_light(row, 0, (0.0, 0.0, 0.0), rng) for _ in range(n)]
+    x, y, z = np.array([d[0] for d in drawn]).T
+    assert_histogram(np.histogram2d(z, np.arctan2(y, x), (8, 8), ((-1, 1), (-np.pi, np.pi)))[0], np.full(64, n / 64))
+    for wi, distance, value, pdf in drawn[:50]:
+        assert distance == np.inf and pdf == pytest.approx(0.25 / np.pi)
+        assert np.allclose(np.array(value) * pdf, lights.sky_radiance(row[0], wi))
 
 
 def test_alpha_of_a_coloured_ball_is_the_mean_of_its_opacities():

@@ -119,6 +119,52 @@ def test_it_agrees_from_inside_and_with_an_opaque_sky(opaque):
     assert_alike(channels(scene, False, 260, 40, view=view), channels(scene, True, 110, 40, view=view))
 
 
+def lit_once(colours, o, d, g, sigma, n=(24, 64, 64)):
+    """Light of a sky scattered once along the ray o + t d through the box of side 2 around 0, by quadrature over the ray, d_z
+    (= s |s|, so that the sky is smooth in pieces) and azimuth."""
+    (u, wu), (v, wv) = (np.polynomial.legendre.leggauss(k) for k in n[:2])
+    ends = np.sort([(-1 - o) / d, (1 - o) / d], axis=0)
+    t0, t1 = ends[0].max(), ends[1].min()
+    breaks = np.array([-1.0, -(0.125**0.5), 0.0, 1.0])
+    half, middle = 0.5 * np.diff(breaks), 0.5 * (breaks[:-1] + breaks[1:])
+    s, ws = (half[:, None] * v + middle[:, None]).ravel(), (half[:, None] * wv).ravel()
+    z, wz = s * np.abs(s), 2 * np.abs(s) * ws
+    a = 2 * np.pi * (np.arange(n[2]) + 0.5) / n[2]
+    w = np.stack(
+        np.broadcast_arrays(
+            np.sqrt(1 - z * z)[:, None] * np.cos(a), np.sqrt(1 - z * z)[:, None] * np.sin(a), z[:, None]
+        ),
+        -1,
+    )
+    sky = np.array([lights.sky_radiance(lights.sky(*colours), (0, 0, height)) for height in z])
+    total = 0.0
+    for t, wt in zip(0.5 * (t1 - t0) * u, 0.5 * (t1 - t0) * wu, strict=True):
+        t += 0.5 * (t1 - t0)
+        p = o + (t0 + t) * d
+        out = np.where(w > 0, (1 - p) / w, (-1 - p) / w).min(-1)
+        f = lobe(g, w @ d) * np.exp(-sigma * (t + out)) * sigma * wt * 2 * np.pi / n[2]
+        total = total + (f[..., None] * (wz[:, None] * sky)[:, None]).sum((0, 1))
+    return total
+
+
+@pytest.mark.parametrize(
+    "colours", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), ((0.1, 0.2, 0.9), 0.8, (0.3, 0.2, 0))]
+)
+@pytest.mark.parametrize("way", [(0.3, 0.6, -0.8), (-0.2, 0.5, 0.1), (0.1, -0.3, 0.9)])
+def test_single_scattering_of_uneven_skies(colours, way):
+    """Against quadrature, seen from above, the side and below: black halves, each of the three parts alone, and all."""
+    d = np.array(way) / np.linalg.norm(way)
+    o, sigma, g = 0.1 - 4 * d, 0.8, 0.5
+    medium = media.homogeneous((-1,) * 3, (1,) * 3, sigma, 1.0, phase=phase.henyey_greenstein(g))
+    scene, view = Scene(medium=medium, lights=[lights.sky(*colours)]), Camera(1, 1, 10.0, look_at(o, o + d))
+    want = lit_once(colours, o, d, g, sigma)
+    rough = np.abs(want - lit_once(colours, o, d, g, sigma, (16, 40, 40))).max()
+    assert rough < 1e-3 * want.max()
+    a, b = (Path(spp=40_000, max_depth=1, jitter=False).render(scene, view, seed=seed) for seed in (1, 2))
+    assert_means(a.rgb, a.variance, want, bias=rough + ROUNDING)
+    assert_means(a.rgb - b.rgb, a.variance + b.variance, 0.0)
+
+
 WHITE = [
     lumps(sigma_t=5.0, albedo=1.0, phase=phase.isotropic()),
     lumps(sigma_t=SIGMA, albedo=1.0, phase=phase.henyey_greenstein(0.9)),
