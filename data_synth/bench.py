@@ -160,6 +160,8 @@ def main(arguments: list[str]) -> int:
     names = args.names
     if args.size < 1:
         raise InputError(f"bench: --size expects a number of pixels, got {args.size}")
+    if args.fork and names and "mitsuba" not in names:
+        raise InputError(f"bench: --fork belongs to mitsuba, got {' '.join(names)}")
     for name in names:
         if name not in BENCHES:
             raise InputError(f"bench: expected one of {', '.join(BENCHES)}, got '{name}'")

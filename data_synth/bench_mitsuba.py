@@ -7,6 +7,7 @@ use, named by DRJIT_LIBLLVM_PATH; without one that line says why it is missing.
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import tempfile
 from pathlib import Path as Folder
@@ -75,6 +76,8 @@ def main(scene: Scene, python: str | None = None, size: int = SIZE) -> None:
         import mitsuba as mi
     except ImportError as error:
         raise InputError("bench mitsuba: mitsuba is not installed, expected 'pip install mitsuba'") from error
+    if python is not None and shutil.which(python) is None:
+        raise InputError(f"bench mitsuba: --fork expects a Python interpreter, {python} is none that can be run")
     camera = scene.viewpoints.camera(-55, 22, size, size)
     given = numbers(scene, camera)
     print(f"\npath tracing to {DEPTH} events, one sun, {size}x{size}; Mitsuba {mi.__version__} volpath")

@@ -26,10 +26,15 @@ from data_synth.errors import InputError
 try:
     import numba
     from numba.core import event
-
-    from data_synth.linking import Compiler, InnerCompiler
 except ImportError as error:
     raise InputError(f"simulated scenes are compiled by numba ({error}): pip install 'nerfvol[synth]'") from error
+
+try:
+    from data_synth.linking import Compiler, InnerCompiler
+except (ImportError, AttributeError):  # another numba's insides: it compiles in its own way, which takes longer
+    from numba.core.compiler import Compiler
+
+    InnerCompiler = Compiler
 
 # error_model="numpy": x/0 is inf as in IEEE 754, no exception branch behind every division.
 # _nrt=False: no array is ever made inside compiled code, so none needs its references counted. Counting them, with
@@ -48,15 +53,22 @@ def plain(function: Callable) -> Callable:
     return getattr(function, "py_func", function)
 
 
+MARKS = (b"@jit", b"@inlined", b"@kernel")
+
+
 @cache
-def _imported(path: Path) -> frozenset[Path]:
-    """The files of this package that a source file imports from."""
-    root, found = Path(__file__).parent, set()
-    for node in ast.walk(ast.parse(path.read_bytes())):
+def _source(path: Path) -> tuple[frozenset[Path], bytes]:
+    """(the files of this package that a source file imports from, what of it machine code depends on: all of it where functions
+    are compiled or the compiler is told how, of others the constants)."""
+    text, root, found = path.read_bytes(), Path(__file__).parent, set()
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == root.name:
             place = root.parent.joinpath(*str(node.module).split("."))
             found |= {place.with_suffix(".py"), *(place / f"{name.name}.py" for name in node.names)}
-    return frozenset(each for each in found if each.is_file())
+    if path == Path(__file__) or not (path.name == "linking.py" or any(mark in text for mark in MARKS)):
+        text = "\n".join(ast.unparse(n) for n in tree.body if isinstance(n, (ast.Assign, ast.AnnAssign))).encode()
+    return frozenset(each for each in found if each.is_file()), text
 
 
 def _stamp(source: str) -> str:
@@ -64,10 +76,8 @@ def _stamp(source: str) -> str:
     files, todo = set(), {Path(source)}
     while todo:
         files |= todo
-        todo = {each for path in todo for each in _imported(path)} - files
-    texts = [path.read_bytes() for path in sorted(files) if path != Path(__file__)]
-    marks = (b"@jit", b"@inlined", b"@kernel")
-    return hashlib.sha256(b"".join(t for t in texts if any(mark in t for mark in marks))).hexdigest()
+        todo = {each for path in todo for each in _source(path)[0]} - files
+    return hashlib.sha256(b"\0".join(_source(path)[1] for path in sorted(files))).hexdigest()
 
 
 def kernel(function: Callable) -> Callable:

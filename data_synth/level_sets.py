@@ -35,9 +35,14 @@ def level_set(
     """
     tree, voxel_size, origin = read_level_set(file, grid)
     solid = of_tree(material, tree, voxel_size, origin)
-    low, high = extent_of(solid)
+    try:
+        low, high = extent_of(solid)
+    except InputError:
+        raise tree.r.fail("it encloses nothing: no value is below 0", "level set") from None
     if size is not None and not 0 < size < np.inf:
         raise InputError(f"level_set: size must be positive, got {size}")
+    if size is not None and not (high > low).any():
+        raise tree.r.fail("a single voxel of it is inside, and that has no size to scale: leave size out", "level set")
     by = 1.0 if size is None else size / (high - low).max()
     middle = 0.5 * (low + high)
     place = middle if centre is None else vector(centre, "centre")

@@ -8,7 +8,10 @@ links all those below it once, makes them its own, so that what is inlined every
 
 from __future__ import annotations
 
-from llvmlite.binding import Linkage
+from functools import cache
+from typing import Any
+
+from llvmlite.binding import Linkage, ModuleRef
 from numba import _dynfunc  # pyright: ignore[reportAttributeAccessIssue]
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -26,12 +29,23 @@ class _Inner(JITCodeLibrary):
         self._raise_if_finalized()
         self._finalized = True
 
+    def alone(self) -> ModuleRef:
+        """Its own code, whose calls lead out of it."""
+        return super()._get_module_for_linking()
+
+    def _get_module_for_linking(self) -> ModuleRef:
+        """With all it calls: what numba compiles in its own way, a density function for example, links nothing else."""
+        whole = self.alone().clone()
+        _link_in_all(whole, self)
+        return whole
+
 
 class _Whole(JITCodeLibrary):
     """The code of a kernel with all it calls."""
 
     def finalize(self) -> None:
-        self._linking_libraries = _callers_first(self)[1:]
+        _link_in_all(self._final_module, self)
+        self._linking_libraries.clear()
         super().finalize()
 
     def _optimize_final_module(self) -> None:
@@ -47,14 +61,20 @@ class _Whole(JITCodeLibrary):
             passes.run(self._final_module, builder)
 
 
+def _link_in_all(module: ModuleRef, library: JITCodeLibrary) -> None:
+    """Link into the code of a library all that it calls, each function once."""
+    for each in _callers_first(library)[1:]:
+        module.link_in(each.alone() if isinstance(each, _Inner) else each._get_module_for_linking(), preserve=True)
+
+
 def _callers_first(library: JITCodeLibrary) -> list[JITCodeLibrary]:
     """A library and all it calls, directly or not, each once and behind all its callers: linking takes of a module what was
-    asked for before."""
+    asked for before. What is no inner function has all it calls in itself."""
     left: dict[JITCodeLibrary, None] = {}
 
     def walk(each: JITCodeLibrary) -> None:
         if each not in left:
-            for called in each._linking_libraries if isinstance(each, (_Inner, _Whole)) else ():
+            for called in each._linking_libraries if isinstance(each, _Inner) or each is library else ():
                 walk(called)
             left[each] = None
 
@@ -101,6 +121,21 @@ NEEDLESS = {
 }  # fmt: skip
 
 
+OF_LIBRARY = (
+    "_codegen", "_final_module", "_finalized", "_get_module_for_linking", "_linking_libraries", "_optimize_final_module",
+    "_optimize_functions", "_raise_if_finalized", "_recorded_timings", "enable_object_caching",
+)  # fmt: skip
+OF_CODEGEN = ("_data_layout", "_module_pass_manager")
+
+
+@cache
+def _fits(codegen: Any) -> bool:
+    """Whether numba has inside what is used here; where not, it compiles in its own way."""
+    library = JITCodeLibrary(codegen, "probe")
+    held = {library: OF_LIBRARY, codegen: OF_CODEGEN, _dynfunc: ("make_function",)}
+    return all(hasattr(each, name) for each, names in held.items() for name in names)
+
+
 class Compiler(CompilerBase):
     """Compiles a kernel."""
 
@@ -109,6 +144,8 @@ class Compiler(CompilerBase):
     def define_pipelines(self):
         """See CompilerBase."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        if not _fits(self.state.targetctx.codegen()):
+            return [passes]
         kept = [(each, words) for each, words in passes.passes if each.__name__ not in NEEDLESS]
         passes.passes = [(self.lowering if each is NativeLowering else each, words) for each, words in kept]
         passes.finalize()

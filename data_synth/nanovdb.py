@@ -25,7 +25,8 @@ MAJOR = 32
 KINDS = {1: "level set", 2: "fog volume"}
 CODECS = ("none", "zip", "blosc")
 HEADER, META, GRID, TREE = 16, 176, 672, 64
-LARGEST = 1 << 33  # bytes of a grid
+LARGEST = 9 << 29  # bytes of a grid: beyond, its voxels are refused in any case
+PLACES = 1 << 16  # of a root: 4096 voxels a side each
 NAMES = ("unknown float double int16 int32 int64 vec3f vec3d mask half uint32 bool rgba8 fp4 fp8 fp16 fpN vec4f vec4d "
          "index").split()  # fmt: skip
 """Of the types of grids, for messages."""
@@ -162,7 +163,8 @@ class NanoTree(Tree):
         root = GRID + self._number("<Q", GRID + 24)
         count, value = self._number("<I", root + 24), self._numbers_at(root + 28, 1)[0]
         self.background = float(value) if self.channels == 1 else value
-        if count > len(data) // 32:
+        self.left = len(data)  # bytes that nodes can take: places that share a node would fill any memory
+        if count > min(PLACES, len(data) // 32):
             raise r.fail(f"its root says it has {count} places")
         for at in range(root + layout.root, root + layout.root + 32 * count, 32):
             key, child, state = self._number("<Q", at), self._number("<q", at + 8), self._number("<I", at + 16)
@@ -189,14 +191,12 @@ class NanoTree(Tree):
         found = np.frombuffer(self._take(at, 4 * n * self.channels), "<f4")
         return found if self.channels == 1 else found.reshape(n, self.channels)
 
-    def _tiles(self, places: np.ndarray, values: np.ndarray, active: np.ndarray, edge: int) -> None:
-        self.boxes += [(places[k], edge, values[k]) for k in np.flatnonzero(active)]
-        if self.channels == 1 and (below := values < 0).any():
-            self.inside.append((places[below], edge, values[below]))
-
     def _internal_at(self, at: int, origin: np.ndarray, log2: int) -> None:
         n, edge = 1 << log2, 128 if log2 == 5 else 8
         bits, entry = n**3, self.layout.entry
+        self.left -= entry * bits
+        if self.left < 0:
+            raise self.r.fail("it says it has more nodes than there is room for")
         active, child = self._mask_at(at + 32, bits), self._mask_at(at + 32 + bits // 8, bits)
         table = self._take(at + (8256 if log2 == 5 else 1088), entry * bits)
         place = np.stack(np.unravel_index(np.arange(bits), (n, n, n)), axis=1) * edge + origin
@@ -214,9 +214,8 @@ class NanoTree(Tree):
             raise self.r.fail("it says it has more leaves than there is room for")
 
     def _read_leaves(self) -> None:
-        n, layout = len(self.leaves), self.layout
-        one = (512,) if self.channels == 1 else (512, self.channels)
-        self.values, self.active = np.empty((n, *one), np.float32), np.empty((n, 512), bool)
+        layout = self.layout
+        self._make_room()
         for k, at in enumerate(self.addresses):
             self.active[k] = self._mask_at(at + 16, 512)
             if not layout.bits:

@@ -68,8 +68,9 @@ def read_vdb(path: str | os.PathLike, name: str | None = None, density: bool = F
 
 
 def read_blocks(path: str | os.PathLike, name: str | None = None) -> VdbBlocks | None:
-    """As ``read_vdb``, without a dense array; None for a grid that is not 0 where nothing is stored."""
-    chosen, others, tree, voxel_size, origin, _ = _read(path, name, True)
+    """As ``read_vdb``, without a dense array; None for a grid that is not 0 where nothing is stored. Without a name it is a
+    density, and a level set refused."""
+    chosen, others, tree, voxel_size, origin, _ = _read(path, name, name is None)
     if np.any(tree.background):
         return None
     first, volume = tree.sparse()
@@ -86,10 +87,11 @@ def read_level_set(path: str | os.PathLike, name: str | None = None) -> tuple[Tr
         raise tree.r.fail(
             f"its grid {chosen} is none: a distance, below 0 inside, and a background above 0", "level set"
         )
-    if not (np.isfinite(tree.values).all() and (voxel_size > 0).all()):
-        raise tree.r.fail(
-            f"its grid {chosen} has values that are no numbers, or a voxel size of {voxel_size}", "level set"
-        )
+    held = [tree.background, tree.values, *(values for _, _, values in tree.inside)]
+    if not all(np.isfinite(v).all() for v in held):
+        raise tree.r.fail(f"its grid {chosen} has values that are infinite or no numbers", "level set")
+    if not (np.isfinite(origin).all() and np.isfinite(voxel_size).all() and (voxel_size > 0).all()):
+        raise tree.r.fail(f"its grid {chosen} has a voxel size of {voxel_size} and its origin at {origin}", "level set")
     return tree, voxel_size, origin
 
 

@@ -20,6 +20,7 @@ from data_synth.vdb_write import ZIP
 
 BLOSC = 4  # a bit of the compression flag
 LIMIT = 1 << 30  # numbers of a dense result; more is refused
+BLOCKS = LIMIT // 512  # tiles, or leaves times channels: more than that cannot be used in any case
 FREE_LIMIT = 1 << 27
 """Numbers of a dense result (512 MiB) that a file of any size may ask for: a few tiles are a fog of constant density."""
 LARGEST_RATIO = 1024
@@ -84,11 +85,7 @@ class Tree:
                 self.inside.append((origin[None].astype(np.int64), 4096, np.array([value], np.float32)))
         for _ in range(children):
             self._internal(r.numbers("<i4", 3).astype(np.int64), 5)
-        one = (512,) if channels == 1 else (512, channels)
-        self.values, self.active = (
-            np.empty((len(self.leaves), *one), np.float32),
-            np.empty((len(self.leaves), 512), bool),
-        )
+        self._make_room()
         for k in range(len(self.leaves)):
             self.values[k], self.active[k] = self._values(512, r.mask(512))
 
@@ -97,16 +94,30 @@ class Tree:
         child, active = self.r.mask(n**3), self.r.mask(n**3)
         values, _ = self._values(n**3, active)
         place = np.stack(np.unravel_index(np.arange(n**3), (n, n, n)), axis=1) * edge + origin
-        for k in np.flatnonzero(active & ~child):
-            self.boxes.append((place[k], edge, values[k]))
-        if self.channels == 1 and (below := (values < 0) & ~child).any():
-            self.inside.append((place[below], edge, values[below]))
+        self._tiles(place[~child], values[~child], active[~child], edge)
         for k in np.flatnonzero(child):
             if log2 == 5:
                 self._internal(place[k], 4)
             else:
                 self.r.take(64)
                 self.leaves.append(place[k])
+
+    def _tiles(self, places: np.ndarray, values: np.ndarray, active: np.ndarray, edge: int) -> None:
+        """Keep tiles that are active, and those below 0."""
+        which = np.flatnonzero(active)
+        if len(self.boxes) + len(which) > BLOCKS:
+            raise self.r.fail(f"it has more than {BLOCKS} active tiles")
+        self.boxes += [(places[k], edge, values[k]) for k in which]
+        if self.channels == 1 and (below := values < 0).any():
+            self.inside.append((places[below], edge, values[below]))
+
+    def _make_room(self) -> None:
+        """``values`` and ``active``, for the leaves that there are."""
+        n = len(self.leaves)
+        if n * self.channels > BLOCKS:
+            raise self.r.fail(f"it has {n} leaves, {n * self.channels / 2**19:.1f} GiB of values")
+        one = (512,) if self.channels == 1 else (512, self.channels)
+        self.values, self.active = np.empty((n, *one), np.float32), np.empty((n, 512), bool)
 
     def _values(self, n: int, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The n values of a node and its active mask, undoing active-mask compression."""

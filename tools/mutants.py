@@ -407,6 +407,8 @@ MUTANTS = (
     M("data_synth/scenes/volumes.py", "coverage, scale, erosion, seed)", "coverage, 1.6, erosion, seed)", STRATUS, "every layer has the same tiles"),
     M("data_synth/scenes/volumes.py", "coverage, scale, erosion, seed)", "coverage, scale, 0.35, seed)", STRATUS, "every layer is as worn"),
     M("data_synth/linking.py", "return list(reversed(left))", "return list(left)", "data_synth/test_jit.py", "code is linked before what asks for it"),
+    M("data_synth/linking.py", "_link_in_all(whole, self)", "pass", "data_synth/test_jit.py", "inner functions bring nothing they call to other code"),
+    M("data_synth/nanovdb.py", "if self.left < 0:", "if False:", "data_synth/test_nanovdb.py", "places share nodes"),
     M("tools/recovered.py", "(weight * np.abs(found - truth)).sum() / total", "np.abs(found - truth).sum() / total", RECOVERED, "errors without their weights"),
     M("tools/recovered.py", "{(weight * found).sum() / total", "{found.sum() / total", RECOVERED, "sums without their weights"),
     M("tools/recovered.py", "compare(density, truth, seen(octree, points, eyes))", "compare(density, truth)", RECOVERED, "what no camera sees counts as seen"),

@@ -1,5 +1,6 @@
 """Media that are several things at once, in plain Python (NUMBA_DISABLE_JIT=1; test_plain.py runs it): detail below the grid
-with grids of albedo, Le, g and S; flakes of every kind on a grid of S; all of it in a scene of many media and in its truth."""
+with grids of albedo, Le, g and S, which plain_fields.py tests one by one; flakes of every kind on a grid of S; furnaces of them
+all; all of it in a scene of many media and in its truth."""
 
 import numpy as np
 import pytest
@@ -66,15 +67,18 @@ def pixel():
     return Camera(1, 1, 50.0, look_at((-3.0, 0.3, -0.2), (0.0, 0.3, -0.2)))
 
 
-@pytest.mark.parametrize("grids", [
-    {"g": BEND, **WARM}, {"S": FIBRES, **WARM}, {"g": BEND, **WHITE},
-    {"S": FIBRES, "phase": phase.microflakes(np.eye(3), micro="glossy", roughness=0.9), **WHITE},
-    {"S": FIBRES, "phase": phase.microflakes(np.eye(3), micro="refractive"), **WARM},
-    {"phase": phase.microflakes(microflakes.beckmann((1, 0, 0), 0.5, 16)), **WARM},
-], ids=["g, warm", "S, warm", "g, white", "S glossy, white", "S refractive, warm", "table, warm"])  # fmt: skip
-def test_furnaces_with_detail(fine, grids):
-    """What glows as the sky does, or loses nothing, is not seen, however its density is eroded."""
-    scene = Scene(medium=medium(fine, **grids), opaque_sky=True, lights=[lights.environment(tuple(SKY))])
+@pytest.mark.parametrize("eroded, grids", [
+    (False, {"g": BEND, **WARM}), (False, {"g": BEND, **WHITE}), (False, {"S": FIBRES, **WARM}),
+    (False, {"S": FIBRES, **WHITE}), (True, {"g": BEND, **WARM}), (True, {"g": BEND, **WHITE}), (True, {"S": FIBRES, **WARM}),
+    (True, {"S": FIBRES, "phase": phase.microflakes(np.eye(3), micro="glossy", roughness=0.9), **WHITE}),
+    (True, {"S": FIBRES, "phase": phase.microflakes(np.eye(3), micro="refractive"), **WARM}),
+    (True, {"phase": phase.microflakes(microflakes.beckmann((1, 0, 0), 0.5, 16)), **WARM}),
+], ids=["g, warm", "g, white", "S, warm", "S, white", "g, warm, eroded", "g, white, eroded", "S, warm, eroded",
+        "S glossy, white, eroded", "S refractive, warm, eroded", "table, warm, eroded"])  # fmt: skip
+def test_furnaces(fine, eroded, grids):
+    """What glows as the sky does, or loses nothing, is not seen, whatever varies in it and however its density is eroded."""
+    own = medium(fine if eroded else None, **grids)
+    scene = Scene(medium=own, opaque_sky=True, lights=[lights.environment(tuple(SKY))])
     picture = Path(spp=80, jitter=False, textbook=True).render(scene, pixel())
     assert_means(picture.rgb, picture.variance, SKY)
 

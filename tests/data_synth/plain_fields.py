@@ -1,4 +1,5 @@
-"""Grids of albedo, Le, g and S, and density functions, in plain Python: test_plain.py runs this file as plain_paths.py.
+"""Grids of albedo, Le, g and S, and density functions, in plain Python: test_plain.py runs this file as plain_paths.py. Their
+furnaces, and what they are beside detail and other media, are in plain_combined.py.
 
 The reference for single scattering and glow along a ray is quadrature of the equation with the formulas that filled the grids;
 formulas are linear in x, y and z, so that trilinear interpolation is exact.
@@ -19,7 +20,6 @@ from data_synth import (
     Path,
     RenderWarning,
     channels,
-    gather,
     lights,
     look_at,
     lookups,
@@ -132,7 +132,6 @@ def test_deep_maps_read_the_fields_and_gathered_light_does_without_g():
     want = (thin * ((1 - a) * e + np.exp(-(x + 1))[:, None] * a * SUN / (4 * np.pi))).sum(axis=0)
     gathered = DeepShadow().render(lit(grey), pixel()).rgb[0, 0]
     assert np.abs(gathered - want).max() < (0.125**2 / 4 + 1e-3) * want.max()
-    assert not gather.possible(lit(media.grid(np.ones((5,) * 3), *BOX, g=at(bend))).world())
     m = medium(albedo=at(albedo), Le=at(glow), g=at(bend))
     mapped = DeepShadow(resolution=17).render(lit(m), pixel()).rgb[0, 0]
     assert np.abs(mapped - emitted - bent).max() < (2.0 * 0.125) ** 2 / 8 * bent.max() + 6e-3
@@ -148,19 +147,6 @@ def test_a_further_medium_has_its_fields_too():
     for integrator in (March(), Path(spp=8, jitter=False, textbook=True)):
         first, second = (integrator.render(s, pixel()).rgb for s in (lit(m), scene))
         assert np.allclose(first, second, rtol=1e-9) and first.min() > 0
-
-
-def test_furnaces():
-    """White and isothermal: what loses nothing, or glows as the sky does, is not seen."""
-    sky = np.array([0.7, 0.4, 0.2])
-    n = 5
-    S = np.stack([sggx.fibre((1, 0.3 * k, 0.1), 0.2 + 0.1 * (k % 5)) for k in range(n**3)]).reshape(n, n, n, 6)
-    white = {"albedo": np.ones((n,) * 3)}
-    warm = {"albedo": at(albedo), "Le": np.broadcast_to(sky, (n, n, n, 3))}
-    for grids in ({"g": at(bend), **white}, {"S": S, **white}, {"S": S, **warm}, {"g": at(bend), **warm}):
-        scene = Scene(medium=medium(**grids), opaque_sky=True, lights=[lights.environment(tuple(sky))])
-        picture = Path(spp=120, jitter=False, textbook=True).render(scene, pixel())
-        assert_means(picture.rgb, picture.variance, sky)
 
 
 def varied(rng, n=3):

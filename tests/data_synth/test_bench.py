@@ -1,11 +1,13 @@
 """What the benchmark's table says: medians of two clocks, errors against a truth, and how many times faster."""
 
 import itertools
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from data_synth import bench, integrators
+from data_synth import InputError, bench, bench_mitsuba, integrators
 from data_synth.scenes.volumes import EVENING_SUN, cumulus
 
 
@@ -46,3 +48,11 @@ def test_the_table_compares_with_shadow_rays_and_makes_maps_again(monkeypatch, c
     for row in rows:  # against shadow rays of a quarter of the step
         error, rms, bias = (float(cell.rstrip("%")) for cell in row[6:])
         assert abs(bias) <= error <= rms and error < 10.0
+
+
+def test_a_fork_that_cannot_be_run_is_said_first(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mitsuba", SimpleNamespace(__version__="3"))
+    with pytest.raises(InputError, match="--fork expects a Python interpreter, nowhere/python is none"):
+        bench_mitsuba.main(cumulus(EVENING_SUN, resolution=16), "nowhere/python", 2)
+    with pytest.raises(InputError, match="--fork belongs to mitsuba, got sky"):
+        bench.main(["sky", "--fork", "python"])

@@ -1,6 +1,7 @@
 """Level sets out of files, in scenes and in pictures: a sphere that OpenVDB itself wrote."""
 
 import os
+import struct
 from pathlib import Path as File
 from typing import Any
 
@@ -11,6 +12,7 @@ from data_synth import (
     InputError,
     March,
     Path,
+    RenderWarning,
     jit,
     level_sets,
     lights,
@@ -147,6 +149,44 @@ def test_a_level_set_is_no_density(tmp_path, command):
     write_grids(tmp_path / "fog.vdb", [fog])
     with pytest.raises(InputError, match="expected an OpenVDB level set, its grid smoke is none"):
         level_sets.level_set(0, tmp_path / "fog.vdb")
+
+
+def written(path, background, *grids):
+    """Grids in a file, the last one with a background of its own."""
+    write_grids(path, grids)
+    data = bytearray(path.read_bytes())
+    at = data.index(struct.pack("<IfII", 1, 0.0, 0, 1), data.rindex(b"ScaleTranslateMap"))
+    struct.pack_into("<f", data, at + 4, background)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("grid, background, size, message", [
+    ({"origin": (0.0, np.nan, 0.0)}, 1.0, None, "its origin at"),
+    ({"voxel_size": (np.inf, 1.0, 1.0)}, 1.0, None, "voxel size of"),
+    ({}, np.inf, None, "infinite or no numbers"), ({}, 1.0, 1.0, "a single voxel of it is inside"),
+    ({"values": np.ones(27)}, 1.0, None, "encloses nothing"),
+])  # fmt: skip
+def test_solids_that_are_none(tmp_path, grid, background, size, message):
+    """Numbers of a file that would have made a picture of nothing, and one voxel alone, which has no extent to be scaled by."""
+    around = np.argwhere(np.ones((3, 3, 3))) + 3
+    given = {"values": np.where((around == 4).all(axis=1), -1.0, 1.0)} | grid
+    path = written(tmp_path / "b.vdb", background, SparseGrid("b", around, **given))
+    with pytest.raises(InputError, match=message) as caught:
+        level_sets.level_set(0, path, size=size)
+    assert "b.vdb" in str(caught.value)
+
+
+def test_a_temperature_below_0_is_no_level_set(tmp_path):
+    """Beside a density it is left out with a word, as any grid is whose background is not 0."""
+    cube = np.argwhere(np.ones((4, 4, 4)))
+    cold = SparseGrid("temperature", cube, -np.ones(64), kind="unknown")
+    path = written(tmp_path / "a.vdb", 20.0, SparseGrid("density", cube, np.ones(64)), cold)
+    with pytest.warns(RenderWarning) as said:
+        assert open_volume(path).heat is None
+    assert "temperature lies on another grid than density" in str(said[0].message)
+    with pytest.raises(InputError, match="grid temperature is a level set"):
+        read_volume(f"{path}:temperature")
 
 
 def test_damage_is_one_sentence(tmp_path):

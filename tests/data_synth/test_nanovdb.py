@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_synth import InputError, RenderWarning, level_sets
+from data_synth import InputError, RenderWarning, level_sets, nanovdb, vdb_tree
 from data_synth.bricks import Sparse
 from data_synth.vdb import grid_names, read_level_set, read_vdb
 from data_synth.volumes import open_volume, read_volume
@@ -108,3 +108,56 @@ def test_damaged_trees_never_escape(tmp_path):
             level_sets.level_set(0, tmp_path / "b.nvdb")
         except InputError as error:
             assert "b.nvdb" in str(error) and "\n" not in str(error)
+
+
+def nodes(uppers, lowers=0, leaves=0, layout=1):
+    """A file of a grid. The root's places share one node of 32^3, the first of its places one of 16^3, the first of that one's
+    a leaf; all others are active tiles."""
+    at = {"root": 64, "upper": 64 + 64 + 32 * uppers}
+    at["lower"] = at["upper"] + 8256 + 8 * 32768
+    at["leaf"] = at["lower"] + 1088 + 8 * 4096
+    data = bytearray(672 + at["leaf"] + nanovdb.LAYOUTS[layout].leaf)
+    data[:8] = b"NanoVDB1"
+    struct.pack_into("<9d", data, 296 + 88, *np.eye(3).ravel())
+    struct.pack_into("<d", data, 296 + 88 + 168, 1.0)
+    struct.pack_into("<Q", data, 672 + 24, at["root"])
+    struct.pack_into("<If", data, 672 + 64 + 24, uppers, 0.0)
+    for k in range(uppers):
+        struct.pack_into("<Qq", data, 672 + 128 + 32 * k, k, at["upper"] - at["root"])
+    for node, head, bits, shared, child in (
+        ("upper", 8256, 32768, lowers, at["lower"] - at["upper"]), ("lower", 1088, 4096, leaves, at["leaf"] - at["lower"]),
+    ):  # fmt: skip
+        start = 672 + at[node]
+        ones, some = b"\xff" * (bits // 8), np.packbits(np.arange(bits) < shared, bitorder="little").tobytes()
+        data[start + 32 : start + 32 + bits // 4] = ones + some
+        table = np.zeros(bits, "<i8")
+        table[:shared] = child
+        data[start + head : start + head + 8 * bits] = table.tobytes()
+    meta = bytearray(176)
+    struct.pack_into("<QQ", meta, 0, len(data), len(data))
+    struct.pack_into("<IIII", meta, 32, layout, 2, 0, 0)
+    struct.pack_into("<I", meta, 136, 2)
+    return b"NanoVDB0" + struct.pack("<IHH", 32 << 21, 1, 0) + bytes(meta) + b"d\0" + bytes(data)
+
+
+@pytest.mark.parametrize("given, message", [
+    ((3,), "more nodes than there is room for"), ((1, 40), "more nodes than there is room for"),
+    ((1, 1, 4096), "more leaves than there is room for"), ((70_000,), "says it has 70000 places"),
+])  # fmt: skip
+def test_nodes_that_several_places_share_do_not_fill_the_memory(tmp_path, given, message):
+    """A file of 300 KB whose places share nodes would have millions of tiles, and billions with three more places."""
+    (tmp_path / "b.nvdb").write_bytes(nodes(*given))
+    with pytest.raises(InputError, match=message):
+        read_vdb(tmp_path / "b.nvdb")
+
+
+def test_more_than_can_be_used_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    """Samples of 4 bits, and tiles, take many times in memory what they take in a file."""
+    (tmp_path / "b.nvdb").write_bytes(nodes(1, 1, 1, layout=13))
+    monkeypatch.setattr(vdb_tree, "BLOCKS", 30_000)
+    with pytest.raises(InputError, match="more than 30000 active tiles"):
+        read_vdb(tmp_path / "b.nvdb")
+    monkeypatch.setattr(vdb_tree, "BLOCKS", 20)
+    for name, grid in (("several.nvdb", "ball4"), ("ball.nvdb", "ball"), ("ball.vdb", "ball")):
+        with pytest.raises(InputError, match=r"it has \d+ leaves, 0.0 GiB of values"):
+            read_vdb(FILES / name, grid)
