@@ -80,6 +80,14 @@ def test_leaves_are_as_wide_as_the_pixels_that_see_them(is_unbounded):
         assert octree.max_level - bounds.n_shells == finest
 
 
+def test_a_camera_in_the_middle_asks_for_the_finest_leaves():
+    """In a room, or where all photographs are taken from one place: what is there has pixels of no width."""
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    for x in (0.0, 1e-200, 1e-9):
+        camera = Camera(LENS, look_at((x, 0.0, 0.0), (x, 1.0, 0.0)))
+        assert convert.finest_level(SceneBounds(box, 16 * box, False), [camera]) == convert.MOST_LEVEL
+
+
 @pytest.mark.parametrize("rays, factor", [
     (100 * 640 * 480, 1), (99 * 640 * 480, 2), (25 * 640 * 480, 2), (24 * 640 * 480, 4), (1, 4),
 ])  # fmt: skip
