@@ -400,7 +400,9 @@ def test_the_outcome_counts_the_steps_of_each_size_and_says_whether_more_would_p
     assert verdicts == {True, False}
     again.stage_steps[:] = 0  # a run whose other phases took all of its time
     sentence = again.outcome()
-    assert sentence is not None and sentence.startswith("steps: none, for there was no time left; the leaves that are seen")
+    assert sentence is not None and sentence.startswith(
+        "steps: none, for there was no time left; the leaves that are seen"
+    )
     assert sentence.endswith("more time would pay")
 
 
