@@ -116,7 +116,7 @@ MUTANTS = (
     M("nerfvol/datasets/listing.py", "wrong <= max(1, FEW * n) and n >= ENOUGH_TO_JUDGE", "wrong <= max(1, FEW * n)", "datasets/test_transforms.py", "of few pictures a damaged one is left out"),
     M("nerfvol/datasets/listing.py", "wrong <= max(1, FEW * n) and", "wrong <= n // 2 and", "datasets/test_transforms.py", "half of the pictures may be damaged"),
     M("nerfvol/datasets/frames.py", "        messages.append(unread_sentence(list(unread.values())))\n", "        pass\n", "datasets/test_transforms.py", "damaged pictures are left out in silence"),
-    M("nerfvol/datasets/load.py", "        messages.append(unread_sentence(wrong))\n", "        pass\n", "datasets/test_transforms.py", "truncated pictures are left out in silence"),
+    M("nerfvol/datasets/decoding.py", "        messages.append(unread_sentence(wrong))\n", "        pass\n", "datasets/test_transforms.py", "truncated pictures are left out in silence"),
     # ---------------------------------------------------------------- extras
     M("nerfvol/octree/plenoctree.py", "values = eval_basis(degree, directions)", "import torch; values = eval_basis(degree, torch.from_numpy(directions)).numpy()", "test_without_torch.py", "PlenOctrees need torch"),
     M("nerfvol/starts/values.py", "held = min(dim, sh.shape[-1])", "held = dim", "starts/test_field.py", "fields of a lower degree"),
@@ -279,7 +279,7 @@ MUTANTS = (
     M("nerfvol/training/session.py", "            begun.discard(\"splats\")", "            pass", "training/test_octree_start.py", "splats that became no octree settle a resumed run"),
     M("nerfvol/config/training.py", "        if begun:\n", "        if False:\n", "training/test_octree_start.py", "another budget changes a resumed run's start"),
     M("nerfvol/training/train.py", '"splats" and run.phase in ("start", "splats") else', '"splats" else', "training/test_resume.py", "an octree's start is trained again on resuming"),
-    M("nerfvol/training/train.py", "run.phase != config.representation:", "True:", "training/test_appearance.py", "resumed runs measure exposures again"),
+    M("nerfvol/training/train.py", "run.phase != begun:", "True:", "training/test_appearance.py", "resumed runs measure exposures again"),
     M("nerfvol/cameras/motions.py", "w - np.cross(pivot, v)", "w + np.cross(pivot, v)", "cameras/test_motions.py", "the gradient of a turn about the pivot"),
     M("nerfvol/cameras/motions.py", "+ pivot - rotation_of(step[:3]) @ pivot", "", "cameras/test_motions.py", "steps about the camera's centre"),
     M("nerfvol/cameras/motions.py", "scale * self.poses[:, :3, 3] @ rotation.T + shift", "self.poses[:, :3, 3] @ rotation.T + shift", "cameras/test_motions.py", "cameras come back without the scale"),

@@ -32,7 +32,8 @@ def arguments(p: argparse.ArgumentParser) -> None:
                    "(docs/relighting.md): fits extinction and albedo of a medium, which can be lit anew")  # fmt: skip
     p.add_argument("--init", metavar="START", help="where it starts. octree: direct (low density everywhere), mlp (a small "
                    "field, trained first and distilled, which auto takes for objects of few views) or splats (trained first, "
-                   "too, which auto takes for other objects where time is short); splats: points (of a "
+                   "too, which auto takes for photographs with a time budget, and for other objects where "
+                   "it is short); splats: points (of a "
                    "COLMAP model), sweep (of planes through the photographs), points+sweep, "
                    "hull (of the silhouettes of a cut-out object), random, or a file of splats or an "
                    "octree (default: auto)")  # fmt: skip

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
 SHORT_RUN = 10.0
-"""Seconds of a time budget up to which an octree begins with low density: distilling a field would take most of them, and
-splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2 dB)."""
+"""Seconds of a time budget up to which an octree of an object begins with low density: distilling a field would take most of
+them, and splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2 dB)."""
 SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
 """... and from there up to which that of an object that many views show begins as splats, or up to so many seconds for each
 pixel of the pictures' shorter side, whichever is later: fog takes most of them to become surfaces (lego 400x400, 1 minute:
@@ -56,10 +56,10 @@ class Config(Checked):
     """File of what is known of the light (medium.lighting): a medium is fitted that can be lit anew."""
     init: str = "auto"
     """Where it starts. An octree: "mlp", a small field that is trained and distilled (auto: of objects with few training
-    views), "splats", which are trained first, too, and whose surfaces it begins with (auto: of other objects where time is
-    short), or "direct", low density everywhere (auto: of all else). A field: auto. Splats: "points" of a COLMAP model, "sweep"
-    of planes through the photographs, "points+sweep", "random", or a file or run of splats or of an octree (auto: what there
-    is)."""
+    views), "splats", which are trained first, too, and whose surfaces it begins with (auto: of photographs with a time
+    budget, and of other objects where it is short), or "direct", low density everywhere (auto: of all else). A field: auto.
+    Splats: "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "random", or a file or run
+    of splats or of an octree (auto: what there is)."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     scene: Literal["auto", "object", "surroundings", "room", "forward"] = "auto"

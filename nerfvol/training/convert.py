@@ -333,4 +333,6 @@ def finest_level(scene: SceneBounds, cameras: Sequence[Camera]) -> int:
     pixel = min(
         float(np.linalg.norm(c.position - scene.center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras
     )
+    # A camera may stand in the middle: in a room, or where all photographs are taken from one place.
+    pixel = max(pixel, 4.0**-MOST_LEVEL * scene.side)
     return int(np.clip(round(math.log2(scene.side / (PIXELS * pixel))), 5, MOST_LEVEL))

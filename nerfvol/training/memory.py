@@ -59,9 +59,9 @@ BYTES_PER_LIT_PIXEL = 28
 BYTES_PER_LIT_SAMPLE = 80
 """Per step along a ray of a medium, looked up or not: position, thickness, transmittance, and what torch keeps of them."""
 SURFACE_LEAVES_PER_SPLAT, SURFACE_LEAVES_PER_PIXEL, PHOTOGRAPH_SURFACE_LEAVES_PER_PIXEL = 32, 2.5, 10.0
-"""Leaves of the octree that splats become, for each splat, and for each pixel of one view of an object or a photograph,
-whichever is less: leaves are no finer than pixels, and fill what all views show. Lego has 6 and 2.3, at 800x800 19 and 1.6;
-bonsai 29 and 4.0, fern 29 and 5.6, at half its size 16 and 9.1."""
+"""Leaves of the octree that splats become, for each splat, and for each pixel of one view of an object or a photograph (in a
+room: of all directions), whichever is less: leaves are no finer than pixels, and fill what all views show. Lego has 6 and 2.3,
+at 800x800 19 and 1.6; bonsai 29 and 4.0, fern 29 and 5.6, at half its size 16 and 9.1."""
 SURFACE_BYTES = 1300
 """A leaf of that octree, while it is made: cells of each Gaussian, sums of what they hold, values of corners. Fern takes 1,040
 to 1,070, a wall of discs that overlap much 1,290."""

@@ -70,4 +70,6 @@ def outcome(widths: NDArray[np.float64], downscales: Sequence[int], stage_steps:
     )
     middle, wide = np.percentile(widths, (50, 95))
     pays = "finer ones would show more: more time would pay" if middle > SHARP else "more time would sharpen little"
+    if not sizes:
+        sizes, pays = "none, for there was no time left", "more time would pay"
     return f"steps: {sizes}; the leaves that are seen are {middle:.1f} pixels wide (95 %: up to {wide:.1f}): {pays}"

@@ -147,7 +147,10 @@ def _how_fine(run: Run, splats: int) -> tuple[tuple[int, int] | None, int]:
     from nerfvol.training.splat_start import start_share
 
     scene, cameras, left = run.data.training.scene, run.data.training.cameras, run.seconds_left()
-    pixels = cameras[0].intrinsics.width * cameras[0].intrinsics.height
+    lens = cameras[0].intrinsics
+    pixels = lens.width * lens.height
+    if run.data.training.kind == "room":  # one view shows a part of what is all around
+        pixels = max(pixels, int(4 * math.pi * lens.fx * lens.fy))
     if not scene.is_unbounded or has_stages_of_its_own(run.given.octree):
         return None, surface_leaves(splats, pixels, scene.is_unbounded)
     rays = rays_of(run.config.octree, None if left is None else (1 - start_share(scene)) * left)

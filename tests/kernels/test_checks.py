@@ -220,6 +220,37 @@ def test_compiled_kernels_run_without_torch():
     assert done.returncode == 0, done.stderr
 
 
+SHORT_OF_MEMORY = """
+    import resource
+    from pathlib import Path
+    import numpy as np
+    from nerfvol.kernels import ops
+    from nerfvol.native import native
+    ops.set_threads(3)
+    codes = np.zeros(1 << 26, np.int64)  # 512 MiB that nobody touches
+    few = codes[:1 << 16]
+    assert native().distinct_codes(few).tolist() == [0]
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (64 << 20), resource.getrlimit(resource.RLIMIT_AS)[1]))
+    for _ in range(3):
+        try:
+            native().distinct_codes(codes)
+        except MemoryError:
+            print("short")
+    print(native().distinct_codes(few).tolist())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits on address space are told by Linux")
+@pytest.mark.skipif(native_module.native() is None, reason="no compiled kernels")
+@pytest.mark.skipif("NERFVOL_EXPECT_KERNELS" in os.environ, reason="sanitizers reserve terabytes of addresses")
+def test_what_fails_in_a_thread_is_an_exception_and_the_others_go_on():
+    """A third of the codes is 171 MiB, which no thread gets of 64."""
+    done = run(SHORT_OF_MEMORY)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["short"] * 3 + ["[0]"]
+
+
 @pytest.mark.skipif(native_module.native() is None, reason="no compiled kernels")
 def test_the_environment_chooses_the_build():
     code = "from nerfvol.kernels import ops; print(ops.isa())"

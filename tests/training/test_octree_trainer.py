@@ -398,6 +398,12 @@ def test_the_outcome_counts_the_steps_of_each_size_and_says_whether_more_would_p
         assert ("more time would pay" in sentence) == (middle > 2) != ("more time would sharpen little" in sentence)
         verdicts.add(middle > 2)
     assert verdicts == {True, False}
+    again.stage_steps[:] = 0  # a run whose other phases took all of its time
+    sentence = again.outcome()
+    assert sentence is not None and sentence.startswith(
+        "steps: none, for there was no time left; the leaves that are seen"
+    )
+    assert sentence.endswith("more time would pay")
 
 
 def test_the_last_pruning_keeps_what_no_ray_has_met_yet(tiny_scene):

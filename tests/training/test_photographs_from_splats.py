@@ -23,8 +23,8 @@ from nerfvol.splats.splats import Splats
 from nerfvol.starts.leaves import PIXELS
 from nerfvol.training import convert, memory, octree_start, session, surface_stages
 from nerfvol.training.appearance import Appearance
-from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
-from tests.fixtures.runs import metrics_of, product, settings, start
+from tests.fixtures.rooms import HALF, draw, facing_cameras, room_cameras, trace_planes, trace_room, write_photographs
+from tests.fixtures.runs import metrics_of, product, run_of, settings, start
 
 pytestmark = pytest.mark.skipif(native() is None, reason="the reference path takes minutes")
 LENS = Intrinsics(48, 36, 45.0, 45.0, 24.0, 18.0, lens=BrownConrady(k1=0.03))
@@ -78,6 +78,14 @@ def test_leaves_are_as_wide_as_the_pixels_that_see_them(is_unbounded):
         # Directions up to 0.15 off the axis lengthen distances by 1 %; a leaf's middle lies up to its side before or behind.
         np.testing.assert_allclose(np.median(widths), expected, rtol=0.05)
         assert octree.max_level - bounds.n_shells == finest
+
+
+def test_a_camera_in_the_middle_asks_for_the_finest_leaves():
+    """In a room, or where all photographs are taken from one place: what is there has pixels of no width."""
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    for x in (0.0, 1e-200, 1e-9):
+        camera = Camera(LENS, look_at((x, 0.0, 0.0), (x, 1.0, 0.0)))
+        assert convert.finest_level(SceneBounds(box, 16 * box, False), [camera]) == convert.MOST_LEVEL
 
 
 @pytest.mark.parametrize("rays, factor", [
@@ -222,6 +230,32 @@ def test_no_more_leaves_come_of_splats_than_are_announced():
     print(splats.n, octree.n_leaves / pixels, octree.n_leaves / splats.n, peak / octree.n_leaves)
     assert before < octree.n_leaves <= now == leaves
     assert peak <= memory.LOOK_BYTES * 3 * pixels + memory.SURFACE_BYTES * leaves
+
+
+def test_leaves_all_around_are_announced(tmp_path):
+    """Discs as wide as pixels on all walls of a room, of which a view shows a part."""
+    lens = Intrinsics(48, 36, 30.0, 30.0, 24.0, 18.0)
+    views = room_cameras(12, lens)
+    folder = write_photographs(tmp_path / "room", views, [draw(camera, trace_room, 1) for camera in views])
+    config = settings_of(folder, tmp_path)
+    config.scene = "room"
+    run = run_of(config)
+    stage, announced = octree_start._how_fine(run, 10**6)
+    assert stage is not None
+    means, scales, side = [], [], 0.03
+    for axis in range(3):
+        across = np.meshgrid(*[np.arange(-half, half, 0.7 * side) for half in np.delete(HALF, axis)])
+        for sign in (-1, 1):
+            wall = np.stack([a.reshape(-1) for a in across], 1)
+            means.append(np.insert(wall, axis, sign * HALF[axis], axis=1))
+            scales.append(np.tile(np.where(np.arange(3) == axis, 0.1 * side, side), (len(wall), 1)))
+    means, scales = np.concatenate(means), np.log(np.concatenate(scales))
+    n, data = len(means), run.data.training
+    walls = Splats(means, scales, np.tile([1.0, 0, 0, 0], (n, 1)), np.full(n, 4.0), dc_of_colour(np.full((n, 3), 0.5)))
+    cameras = [camera.scaled(stage[1]) for camera in data.cameras]
+    octree = convert.surfaces_of(walls, data.scene, cameras, (1, 1, 1), stage[0])
+    view = memory.surface_leaves(n, lens.width * lens.height // stage[1] ** 2)
+    assert view < octree.n_leaves <= announced
 
 
 def test_a_lens_that_cannot_be_undone_leaves_low_density(tmp_path, scene, monkeypatch):

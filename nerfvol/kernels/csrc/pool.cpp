@@ -2,8 +2,10 @@
 
 #include <atomic>
 #include <condition_variable>
+#include <exception>
 #include <mutex>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #if defined(__unix__) || defined(__APPLE__)
@@ -20,12 +22,19 @@ struct Pool {
     std::vector<std::thread> workers;
     const std::function<void(int, int)>* task = nullptr;
     std::atomic<int> next{0};
+    std::exception_ptr failure;  // what a task threw, for want of memory say: thrown again by the call
     int n = 0, running = 0;
     long epoch = 0;
     bool stop = false;
 
     void work(int thread) {
-        for (int i; (i = next.fetch_add(1)) < n;) (*task)(i, thread);
+        try {
+            for (int i; (i = next.fetch_add(1)) < n;) (*task)(i, thread);
+        } catch (...) {
+            std::lock_guard<std::mutex> lock(m);
+            if (!failure) failure = std::current_exception();
+            next = n;  // nobody begins another
+        }
     }
     void loop(int thread) {
         long seen = 0;
@@ -107,6 +116,7 @@ void parallel_for(int n, const std::function<void(int, int)>& task) {
     } else {
         p.work(0);
     }
+    if (p.failure) std::rethrow_exception(std::exchange(p.failure, nullptr));
 }
 
 }  // namespace nerfvol
