@@ -20,6 +20,7 @@ TESTS = (
     *(f"kernels/{name}.py" for name in ("test_ops", "test_train", "test_determinism", "test_checks", "test_view")),
     "kernels/test_field_steps.py", "kernels/test_field_march.py", "splats/test_point_surfaces.py", "octree/test_merge.py",
     "splats/test_gradients.py", "splats/test_step.py", "starts/test_plane_sweep.py", "datasets/test_photographs.py",
+    "octree/test_lod.py", "starts/test_surfaces.py",
 )  # fmt: skip
 
 
