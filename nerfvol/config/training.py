@@ -33,8 +33,8 @@ them, and splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2
 SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
 """... and from there up to which that of an object that many views show begins as splats, or up to so many seconds for each
 pixel of the pictures' shorter side, whichever is later: fog takes most of them to become surfaces (lego 400x400, 1 minute:
-33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3). Later that costs nothing any
-more, and what splats left out would be missing (docs/performance.md)."""
+33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3; docs/performance.md). Longer runs
+were not compared: there fog takes a small share of the time, and what splats left out would be missing."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
