@@ -51,7 +51,9 @@ def workers(client) -> dict[str, int]:
 def test_results_come_once_and_in_order_from_all_workers(client, seconds):
     results = list(Window(client, job("double", seconds=seconds), Needs()).results(range(120)))
     assert [value for value, _ in results] == [2 * k for k in range(120)]
-    assert {process for _, process in results} == set(workers(client).values())
+    processes, who = {process for _, process in results}, set(workers(client).values())
+    # What takes no time is done in a handful of tasks, which one worker may have ended before the other asks for any.
+    assert processes == who if seconds else processes <= who
 
 
 def test_no_more_is_on_its_way_than_the_window_says(client):
