@@ -7,6 +7,7 @@ reads the settings, few use a field. u is the scene unit.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +33,9 @@ SHORT_RUN = 10.0
 them, and splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2 dB)."""
 SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
 """... and from there up to which that of an object that many views show begins as splats, or up to so many seconds for each
-pixel of the pictures' shorter side, whichever is later: fog takes most of them to become surfaces (lego 400x400, 1 minute:
-33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3; docs/performance.md). Longer runs
-were not compared: there fog takes a small share of the time, and what splats left out would be missing."""
+pixel of the pictures' shorter side, whichever is later; longer runs begin with a field. Fog takes most of the time to become
+surfaces (lego 400x400, 1 minute: 33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3,
+5 minutes: 35.0, 35.2, 34.7; docs/performance.md)."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
@@ -56,8 +57,9 @@ class Config(Checked):
     """File of what is known of the light (medium.lighting): a medium is fitted that can be lit anew."""
     init: str = "auto"
     """Where it starts. An octree: "mlp", a small field that is trained and distilled (auto: of objects with few training
-    views), "splats", which are trained first, too, and whose surfaces it begins with (auto: of photographs with a time
-    budget, and of other objects where it is short), or "direct", low density everywhere (auto: of all else). A field: auto.
+    views or a long time budget), "splats", which are trained first, too, and whose surfaces it begins with (auto: of
+    photographs with a time budget, and of other objects where it is short), or "direct", low density everywhere (auto: of all
+    else, and of what may be a medium). A field: auto.
     Splats: "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "random", or a file or run
     of splats or of an octree (auto: what there is)."""
     time_budget: Annotated[float | None, seconds] = None
@@ -156,7 +158,7 @@ class Config(Checked):
         """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
         few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
         smoothness in any case. Of one that many views show, and in photographs, splats are there sooner than fog has become
-        surfaces; photographs keep haze that fog leaves for good.
+        surfaces, and where there is more time a field; photographs keep haze that fog leaves for good.
 
         is_simulated: the data may show a medium, whose density counts: no splats, which are surfaces. begun: the phases that a
         resumed run has begun: another time budget, which it may have, must not choose another start. side: of the pictures,
@@ -170,10 +172,9 @@ class Config(Checked):
         elif few:
             start = "auto" if budget is not None and budget <= SHORT_RUN else "mlp"
         else:
-            until = max(SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL * side)
-            is_short = budget is not None and SHORT_RUN < budget <= until
-            suits = budget is not None if scene.is_unbounded else is_short
-            start = "splats" if suits and not is_simulated else "auto"
+            until = math.inf if scene.is_unbounded else max(SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL * side)
+            is_too_short = budget is None or (budget <= SHORT_RUN and not scene.is_unbounded)
+            start = "auto" if is_too_short or is_simulated else "splats" if budget <= until else "mlp"
         init = start if self.init == "auto" else self.init
         return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS if few else {}))
 

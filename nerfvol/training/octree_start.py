@@ -54,8 +54,9 @@ Optimise = Callable[[Run, Phase], None]
 def why_start(config: Config, n_views: int, photographs: bool = False) -> str | None:
     """A sentence on the start that was chosen for ``n_views`` training views; None: low density, which needs none."""
     if config.init == "mlp":
-        return (f"start: a field, then the octree that it is distilled to, for there are only {n_views} training "
-                "views; --init direct overrules")  # fmt: skip
+        few = n_views <= config.field.few_views
+        why = f"there are only {n_views} training views" if few else "there is time for one"
+        return f"start: a field, then the octree that it is distilled to, for {why}; --init direct overrules"
     if config.init == "splats":
         why = (
             "low density would leave haze in photographs" if photographs else f"{config.time_budget or 0:g} s are short"

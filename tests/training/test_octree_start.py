@@ -31,7 +31,7 @@ PHOTOGRAPHS = SceneBounds(BOX, 16 * BOX, False)
 
 # ---------------------------------------------------------------- which start
 @pytest.mark.parametrize("views, given, expected", [
-    (17, {"time_budget": SPLATS_UNTIL}, "splats"), (17, {"time_budget": SPLATS_UNTIL + 1}, "auto"),
+    (17, {"time_budget": SPLATS_UNTIL}, "splats"), (17, {"time_budget": SPLATS_UNTIL + 1}, "mlp"),
     (16, {"time_budget": SPLATS_UNTIL}, "mlp"), (17, {}, "auto"), (100, {"time_budget": SHORT_RUN}, "auto"),
     (100, {"time_budget": SHORT_RUN + 1}, "splats"),
     (17, {"time_budget": 20.0, "init": "direct"}, "direct"), (17, {"time_budget": 20.0, "init": "mlp"}, "mlp"),
@@ -42,10 +42,10 @@ PHOTOGRAPHS = SceneBounds(BOX, 16 * BOX, False)
     (16, {"init": "splats"}, "splats"),
 ])  # fmt: skip
 def test_octrees_of_objects_begin_as_splats_where_time_is_short(views, given, expected):
-    """... and views are many; what somebody chose stays."""
+    """... and views are many, and with a field where it is long or they are few; what somebody chose stays."""
     config, scene = Config(**given), SceneBounds(BOX, None, True)
     assert config.for_views(views, scene).init == expected
-    kept = "auto" if (expected, config.init) == ("splats", "auto") else expected
+    kept = "auto" if config.init == "auto" and views > config.field.few_views else expected
     assert config.for_views(views, scene, is_simulated=True).init == kept  # what may be a medium has no surfaces
 
 
@@ -54,7 +54,7 @@ def test_large_pictures_begin_as_splats_for_longer():
     scene = SceneBounds(BOX, None, True)
     for side, until in ((40, SPLATS_UNTIL), (400, SPLATS_UNTIL), (800, 120.0)):
         starts = [Config(time_budget=budget).for_views(100, scene, side=side).init for budget in (until, until + 1)]
-        assert starts == ["splats", "auto"]
+        assert starts == ["splats", "mlp"]
 
 
 @pytest.mark.parametrize("given, expected", [
@@ -75,7 +75,7 @@ def test_octrees_of_photographs_begin_as_splats(given, expected, views):
 
 
 @pytest.mark.parametrize("given, phases, expected", [
-    ({}, (), "auto"), ({}, ("splats", "octree"), "splats"), ({}, ("field",), "mlp"), ({}, ("octree",), "auto"),
+    ({}, (), "mlp"), ({}, ("splats", "octree"), "splats"), ({}, ("field",), "mlp"), ({}, ("octree",), "auto"),
     ({"init": "mlp"}, ("octree",), "mlp"), ({"representation": "octree"}, ("splats",), "splats"),
     ({"representation": "splats"}, ("splats",), "auto"), ({"representation": "field"}, ("field",), "auto"),
 ])  # fmt: skip
@@ -101,7 +101,7 @@ def test_another_budget_does_not_choose_another_start_half_way(tmp_path, tiny_sc
     config.time_budget = 20.0
     assert Run(config, data, Clock(0.0, 0.0), {**saved, "steps": {"octree": 3}}).config.init == "auto"
     config.time_budget = 1000.0
-    assert Run(config, data, Clock(0.0, 0.0), None).config.init == "auto"
+    assert Run(config, data, Clock(0.0, 0.0), None).config.init == "mlp"
     for results, init in (({}, "auto"), ({"converted": {}}, "splats")):  # splats that became no octree left low density
         both = {"phase": "octree", "log_bytes": 0, "results": results, "steps": {"splats": 3, "octree": 1}}
         assert Run(config, data, Clock(0.0, 0.0), both).config.init == init
@@ -120,6 +120,9 @@ def test_the_choice_is_one_sentence():
     assert octree_start.why_start(Config(init="direct"), 8) is None and octree_start.why_start(Config(), 8) is None
     field, splats = (octree_start.why_start(Config(init=init, time_budget=30.0), 8) or "" for init in ("mlp", "splats"))
     assert "only 8 training views" in field and field.startswith("start: a field, ")
+    long = octree_start.why_start(Config(init="mlp", time_budget=300.0), 100)
+    assert long == ("start: a field, then the octree that it is distilled to, for there is time for one; --init direct "
+                    "overrules")  # fmt: skip
     assert splats == ("start: splats, then the octree of the surfaces that they show, for 30 s are short; "
                       "--init direct overrules")  # fmt: skip
     photographs = octree_start.why_start(Config(init="splats", time_budget=90.0), 8, photographs=True)
