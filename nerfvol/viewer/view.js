@@ -112,7 +112,6 @@ let pressed = null;  // where a pointer went down that has not moved
 canvas.addEventListener("pointerdown", (event) => {
   stop();
   pressed = place(event);
-  canvas.focus({ preventScroll: true });
   try { canvas.setPointerCapture(event.pointerId); } catch { /* a pointer that is gone already */ }
   pointers.set(event.pointerId, place(event));
 });

@@ -164,6 +164,15 @@ def test_the_wheel_goes_to_the_pointer(fresh):
     assert np.allclose(after["position"], anchor + factor * (before["position"] - anchor), atol=1e-9)
 
 
+def test_a_drag_gives_keys_to_the_view_without_a_frame_around_it(fresh):
+    fresh.evaluate("document.activeElement.blur()")
+    drag(fresh, 50, 10)
+    assert fresh.evaluate("document.activeElement.id") == "canvas"
+    assert not fresh.evaluate("document.querySelector('#canvas').matches(':focus-visible')")  # for those who come by keys
+    fresh.keyboard.press("ArrowRight")
+    assert fresh.evaluate("document.querySelector('#canvas').matches(':focus-visible')")
+
+
 def test_keys_fly_turn_and_choose(fresh):
     fresh.focus("#canvas")
     before = camera(fresh)
