@@ -29,7 +29,7 @@ OPACITIES = {"random": 0.3, "hull": 0.8}
 """Random points are mostly nowhere: they begin fainter than points that were found (0.5); what silhouettes leave is opaque."""
 
 
-START_SHARE, START_SHARE_OF_PHOTOGRAPHS = 0.35, 0.25
+START_SHARE, START_SHARE_OF_PHOTOGRAPHS = 0.25, 0.18
 """Of the time left in a run, what splats take that an octree is made of, ..."""
 START_STEPS = 700
 """... and their steps, at most, where there is no time budget."""

@@ -1,23 +1,30 @@
-"""How fine an octree of photographs begins and ends that begins with surfaces: as fine as there are rays for.
+"""How fine an octree begins and ends that begins with surfaces: as fine as there are rays for.
 
 Every leaf that a picture's pixels ask for is there from the start, and a leaf that no ray meets stays what splats said of it.
 So photographs are looked at in the size of which the run can draw each pixel about once, and leaves are as wide as those
-pixels: of photographs of 12 million pixels a minute sees an eighth of the size, of small ones all there is.
+pixels: of photographs of 12 million pixels a minute sees an eighth of the size, of small ones all there is. Of cut-out objects
+most is background, and they are looked at as they are.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig
 from nerfvol.errors import InputError
 from nerfvol.kernels.state import TILE_RAYS
+from nerfvol.region import SceneBounds
+from nerfvol.starts.leaves import PIXELS
 
-RAYS_PER_SECOND = 400_000.0
-"""What a second of a time budget is worth: rays of an octree of surfaces on two cores, some 10 segments each."""
+MOST_LEVEL = 10
+RAYS_PER_SECOND, RAYS_PER_SECOND_OF_OBJECTS = 400_000.0, 1_200_000.0
+"""What a second of a time budget is worth: rays of an octree of surfaces on two cores, some 10 segments each in photographs."""
 EPOCHS = 1.0
 """Times that each pixel of the photographs is drawn, at least, in the size that is chosen."""
 EPOCHS_OF_FINER = 3.0
@@ -28,6 +35,30 @@ SMALLEST = 100
 MOST_FACTOR = 256
 STAGE = {"stage_ends": [1.0], "tiles": [320], "prunes": [2]}
 """All of the run: there is no haze that small pictures would have to clear first."""
+
+
+def finest_level(scene: SceneBounds, cameras: Sequence[Camera]) -> int:
+    """Level whose leaves are about PIXELS wide at the scene's middle for the nearest camera, at most MOST_LEVEL."""
+    pixel = min(
+        float(np.linalg.norm(c.position - scene.center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras
+    )
+    # A camera may stand in the middle: in a room, or where all photographs are taken from one place.
+    pixel = max(pixel, 4.0**-MOST_LEVEL * scene.side)
+    return int(np.clip(round(math.log2(scene.side / (PIXELS * pixel))), 5, MOST_LEVEL))
+
+
+def stage_for(
+    scene: SceneBounds, cameras: Sequence[Camera], config: OctreeConfig, seconds: float | None, least: int = 1
+) -> tuple[int, int] | None:
+    """The one stage of an octree of surfaces that is trained for ``seconds`` (None: the steps of ``config``): level of its
+    finest leaves and factor, ``least`` or more, of the pictures' reduction. None: the stages of the settings, for an object
+    that there is time to look at more often."""
+    rays = rays_of(config, seconds, scene.is_unbounded)
+    if not scene.is_unbounded:
+        return None if levels_finer(cameras, rays) else (finest_level(scene, cameras), 1)
+    factor = max(least, image_factor(cameras, rays))
+    cameras = [camera.scaled(factor) for camera in cameras]
+    return finest_level(scene, cameras) + levels_finer(cameras, rays), factor
 
 
 def image_factor(cameras: Sequence[Camera], rays: float) -> int:
@@ -49,9 +80,11 @@ def _pixels(cameras: Sequence[Camera]) -> int:
     return sum(camera.intrinsics.width * camera.intrinsics.height for camera in cameras)
 
 
-def rays_of(config: OctreeConfig, seconds: float | None) -> float:
-    """Rays that ``seconds`` are worth; None: those of the settings' steps."""
-    return config.steps * config.tiles[-1] * TILE_RAYS if seconds is None else RAYS_PER_SECOND * seconds
+def rays_of(config: OctreeConfig, seconds: float | None, photographs: bool = True) -> float:
+    """Rays that ``seconds`` are worth, of an object or of ``photographs``; None: those of the settings' steps."""
+    if seconds is None:
+        return config.steps * config.tiles[-1] * TILE_RAYS
+    return (RAYS_PER_SECOND if photographs else RAYS_PER_SECOND_OF_OBJECTS) * seconds
 
 
 def has_stages_of_its_own(given: OctreeConfig) -> bool:

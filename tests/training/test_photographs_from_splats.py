@@ -85,7 +85,7 @@ def test_a_camera_in_the_middle_asks_for_the_finest_leaves():
     box = np.array([[-1.0] * 3, [1.0] * 3])
     for x in (0.0, 1e-200, 1e-9):
         camera = Camera(LENS, look_at((x, 0.0, 0.0), (x, 1.0, 0.0)))
-        assert convert.finest_level(SceneBounds(box, 16 * box, False), [camera]) == convert.MOST_LEVEL
+        assert surface_stages.finest_level(SceneBounds(box, 16 * box, False), [camera]) == surface_stages.MOST_LEVEL
 
 
 @pytest.mark.parametrize("rays, factor", [
@@ -106,6 +106,15 @@ def test_what_a_time_or_steps_are_worth():
     assert surface_stages.has_stages_of_its_own(OctreeConfig(levels=[5, 6, 7, 8, 8, 9, 9]))
 
 
+@pytest.mark.parametrize("seconds, one", [(0.1, True), (7.6, True), (7.8, False), (None, False)])
+def test_a_cut_out_object_is_looked_at_as_it_is(seconds, one):
+    """In one stage of whole pictures, until each pixel could be drawn three times (7.68 s); then in those of the settings."""
+    cameras = [Camera(Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0), np.eye(4))] * 10
+    bounds = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]) + [0.0, 0.0, -5.0], None, True)
+    stage = surface_stages.stage_for(bounds, cameras, OctreeConfig(), seconds)
+    assert stage == ((surface_stages.finest_level(bounds, cameras), 1) if one else None)
+
+
 @pytest.mark.parametrize("seconds, factor", [(24.0, 1), (22.0, 1), (7.0, 2), (1.0, 4)])
 def test_a_conversion_that_is_trained_is_as_fine_as_its_time(monkeypatch, seconds, factor):
     """Ten photographs of 640x480 and a clock that stands; leaves as the cameras so reduced ask for, and one level finer where
@@ -120,7 +129,9 @@ def test_a_conversion_that_is_trained_is_as_fine_as_its_time(monkeypatch, second
     )
     assert 7.5 * surface_stages.RAYS_PER_SECOND < 10 * 640 * 480 < 8 * surface_stages.RAYS_PER_SECOND
     _, config = convert.surfaces_to_train(discs(5.0, 0.1, 0.1), dataset, (1, 1, 1), Config(time_budget=seconds))
-    level = convert.finest_level(bounds, [camera.scaled(factor) for camera in cameras]) + (seconds in (7.0, 24.0))
+    level = surface_stages.finest_level(bounds, [camera.scaled(factor) for camera in cameras]) + (
+        seconds in (7.0, 24.0)
+    )
     assert seen[0][1] == level and seen[0][0][0].intrinsics.width == 640 // factor
     assert (config.octree.levels, config.octree.downscales) == ([level], [factor])
     convert.surfaces_to_train(discs(5.0, 0.1, 0.1), dataset, (1, 1, 1), Config(time_budget=seconds), level=6)
