@@ -47,9 +47,9 @@ def score_views(
     """Scores of ``render`` (camera -> (H, W, 3) float32) against every image of ``dataset`` over ``background``.
 
     Returns psnr and ssim (means of the per-view values), seconds_per_frame (median, without the first) and rows with name,
-    psnr, ssim and seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that masks leave out,
-    or that the lens does not reach, take no part; views of which nothing is left have no row. ``colour_fit``: also
-    psnr_fitted and ssim_fitted, of the render after the colour map that brings it nearest to the photograph
+    psnr, ssim and seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that
+    masks leave out, or that the lens does not reach, take no part; views of which nothing is left have no row. ``colour_fit``:
+    also psnr_fitted and ssim_fitted, of the render after the colour map that brings it nearest to the photograph
     (measure.colour_fit): without what the camera's exposure and white balance do. ``fitted``: cameras whose poses were fitted
     to the model (measure.pose_fit): also psnr_posed and ssim_posed, seen from there, and the colour fit is made there.
     """
