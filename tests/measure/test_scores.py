@@ -105,7 +105,7 @@ def test_eval_command(tmp_path, tiny_scene, sphere_octree, command):
     assert record["threads"] == 1 and record["split"] == "test" and record["kernel_path"]
     assert record["hardware"]["cpu"] and record["hardware"]["cores"] >= 1
     assert record["psnr"] == pytest.approx(np.mean([row["psnr"] for row in record["rows"]]))
-    assert 0 < record["seconds_per_frame"] < 5
+    assert record["seconds_per_frame"] > 0
     for row in record["rows"]:
         # truth | render | error | depth, 8 pixels apart
         assert np.asarray(Image.open(images / f"{row['name']}.png")).shape == (40, 4 * 40 + 3 * 8, 3)
