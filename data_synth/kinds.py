@@ -27,10 +27,13 @@ from data_synth.errors import InputError
 def volume(
     file: str, size: float = 2.0, centre: media.Point = (0.0, 0.0, 0.0), sigma_t: Any = 1.0, albedo: Any = 0.0,
     Le: Any = 0.0, phase: Any = None, kelvin: float | None = None, heat: float = 1.0,
+    up: str = "z",
 ) -> media.Medium:  # fmt: skip
     """A density volume, its largest sample scaled to 1, its longest side ``size``; sigma_t in 1/u. albedo is multiplied by the
-    colours (Cd) that the file holds; kelvin: its temperature or flame glows as in ``volumes.Volume.glow``, instead of Le."""
+    colours (Cd) that the file holds; kelvin: its temperature or flame glows as in ``volumes.Volume.glow``, instead of Le.
+    up: the file's axis that is upright, y (as film programs have it) or z; size and centre are of what is turned."""
     found = volumes.open_volume(file, uses=("colour",) if kelvin is None else ("colour", "heat"))
+    found = found.upright() if volumes.is_turned(up) else found
     values, hot = found.density, found.heat
     if values.max() <= 0:
         raise InputError(f"{file}: expected a density that is somewhere positive, got at most {values.max():g}")

@@ -18,6 +18,7 @@ from data_synth.crossings import INSIDE, OUTSIDE, LevelSet
 from data_synth.errors import InputError
 from data_synth.media import triple
 from data_synth.vdb import read_level_set
+from data_synth.volumes import is_turned
 
 if TYPE_CHECKING:
     from data_synth.vdb_tree import Tree
@@ -27,14 +28,17 @@ NEAR_ZERO = 1e-6  # of a brick's largest sample: bricks whose samples come that 
 
 def level_set(
     material: int, file: str | os.PathLike, grid: str | None = None, size: float | None = None,
-    centre: ArrayLike | None = None,
+    centre: ArrayLike | None = None, up: str = "z",
 ) -> LevelSet:  # fmt: skip
     """The solid of an OpenVDB file: its grid of class "level set", or the one called ``grid``.
 
     size: its longest side in u, by default as in the file; centre: the middle of its box, by default where the file has it.
+    up: the file's axis that is upright, y (as film programs have it) or z.
     """
+    turned = is_turned(up)
     tree, voxel_size, origin = read_level_set(file, grid)
     solid = of_tree(material, tree, voxel_size, origin)
+    solid = upright(solid) if turned else solid
     try:
         low, high = extent_of(solid)
     except InputError:
@@ -48,6 +52,18 @@ def level_set(
     place = middle if centre is None else vector(centre, "centre")
     cell = triple(by * np.array(solid.cell))
     return solid._replace(lo=triple(place + by * (np.array(solid.lo) - middle)), cell=cell)
+
+
+def upright(s: LevelSet) -> LevelSet:
+    """With y up turned to z up, right-handed: x, y, z -> x, -z, y."""
+    a, b, c = s.bricks
+    offsets = np.ascontiguousarray(s.offsets.reshape(s.bricks)[:, :, ::-1].transpose(0, 2, 1)).ravel()
+    samples = s.samples[1:].reshape(-1, SIDE, SIDE, SIDE)[..., ::-1].transpose(0, 1, 3, 2)
+    lo = (s.lo[0], -(s.lo[2] + BRICK * c * s.cell[2]), s.lo[1])
+    cell = (s.cell[0], s.cell[2], s.cell[1])
+    return s._replace(
+        lo=lo, cell=cell, bricks=(a, c, b), offsets=offsets, samples=np.concatenate([s.samples[:1], samples.ravel()])
+    )
 
 
 def extent_of(s: LevelSet) -> tuple[np.ndarray, np.ndarray]:

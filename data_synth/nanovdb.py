@@ -18,7 +18,7 @@ import numpy as np
 
 from data_synth.blosc import decompress
 from data_synth.errors import InputError
-from data_synth.vdb_tree import LARGEST_RATIO, Reader, Tree
+from data_synth.vdb_tree import LARGEST_RATIO, Contents, Reader, Tree, unused
 
 MAGIC = (b"NanoVDB0", b"NanoVDB2")  # of files; of grids NanoVDB0 or NanoVDB1
 MAJOR = 32
@@ -72,8 +72,8 @@ class _File(Reader):
         return InputError(f"{self.path}: expected a NanoVDB {wanted}, {what}")
 
 
-def contents(path: str | os.PathLike) -> tuple[Reader, dict[str, Stored], list[str]]:
-    """(reader, grids of float and vec3f by name, names of others)."""
+def contents(path: str | os.PathLike) -> Contents:
+    """What a file holds: of float and vec3f, and of other types."""
     try:
         r = _File(Path(path).read_bytes(), path)
     except OSError as error:
@@ -91,19 +91,22 @@ def contents(path: str | os.PathLike) -> tuple[Reader, dict[str, Stored], list[s
         listed = [_listed(r, codec) for _ in range(count)]
         for one, kind in listed:
             one = one._replace(at=r.at)
-            r.take(one.stored)
+            try:
+                r.take(one.stored)
+            except InputError as error:
+                return Contents(r, held, others, error)
             if one.channels:
-                held.setdefault(one.name, one)
+                held[unused(one.name, held)] = one
             else:
                 others.append(f"{one.name} ({kind})")
-    return r, held, others
+    return Contents(r, held, others)
 
 
 def _listed(r: Reader, codec: int) -> tuple[Stored, str]:
     meta = r.take(META)
     size, stored = struct.unpack_from("<QQ", meta)
     kind, class_ = struct.unpack_from("<II", meta, 32)
-    name = r.take(struct.unpack_from("<I", meta, 136)[0]).split(b"\0")[0].decode("utf-8", "replace")
+    name = r.take(struct.unpack_from("<I", meta, 136)[0]).split(b"\0")[0].decode("utf-8", "replace") or "[0]"
     if size > min(LARGEST, LARGEST_RATIO * (stored + 64)):
         raise r.fail(f"the grid {name} says it has {size} bytes")
     said = NAMES[kind] if kind < len(NAMES) else f"type {kind}"

@@ -215,7 +215,7 @@ class _File:
             if not isinstance(value, str):
                 raise self.fail(where, f"expected a file name, got {value}")
             return str(self.path.parent / value)
-        if key in ("back", "kind", "micro") or (key == "grid" and isinstance(value, str)):
+        if key in ("back", "kind", "micro", "up") or (key == "grid" and isinstance(value, str)):
             return value
         if key in ("diffuse", "fibre", "schlick"):
             if not isinstance(value, bool):

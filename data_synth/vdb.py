@@ -17,7 +17,7 @@ import numpy as np
 from data_synth import nanovdb
 from data_synth.bricks import Sparse
 from data_synth.errors import InputError
-from data_synth.vdb_tree import Reader, Tree
+from data_synth.vdb_tree import Contents, Reader, Tree, unused
 from data_synth.vdb_write import MAGIC
 
 LEVEL_SET = "level set"
@@ -51,7 +51,8 @@ class VdbBlocks:
 
 
 class _Held(NamedTuple):
-    """Where a grid lies in its file. channels: 3 for vectors. kind: OpenVDB's class, such as "level set", or "" for none."""
+    """Where a grid lies in its file. channels: 3 for vectors. kind: OpenVDB's class, such as "level set", or "" for none, or
+    where the grid's head is damaged."""
 
     position: int
     half: bool
@@ -80,8 +81,10 @@ def read_blocks(path: str | os.PathLike, name: str | None = None) -> VdbBlocks |
 def read_level_set(path: str | os.PathLike, name: str | None = None) -> tuple[Tree, np.ndarray, np.ndarray]:
     """(tree, voxel size, origin) of the grid called ``name``; by default the first of class "level set", else the one that
     ``read_vdb`` takes."""
-    _, held, _ = _contents(path)
-    solids = [n for n, h in held.items() if h.kind == LEVEL_SET and h.channels == 1]
+    found = _contents(path)
+    if name is None and found.damage:
+        raise found.damage
+    solids = [n for n, h in found.grids.items() if h.kind == LEVEL_SET and h.channels == 1]
     chosen, _, tree, voxel_size, origin, _ = _read(path, name or (solids[0] if solids else None), False)
     if tree.channels != 1 or not tree.background > 0:
         raise tree.r.fail(
@@ -97,12 +100,11 @@ def read_level_set(path: str | os.PathLike, name: str | None = None) -> tuple[Tr
 
 def grid_names(path: str | os.PathLike) -> tuple[dict[str, int], tuple[str, ...]]:
     """({name: numbers a voxel has} of the grids that can be read, names of the others)."""
-    _, held, others = _contents(path)
-    return {name: h.channels for name, h in held.items()}, tuple(others)
+    found = _contents(path)
+    return {name: h.channels for name, h in found.grids.items()}, tuple(found.others)
 
 
-def _contents(path: str | os.PathLike) -> tuple[Reader, dict[str, Any], list[str]]:
-    """(reader, float and vec3s grids by name, names of others)."""
+def _contents(path: str | os.PathLike) -> Contents:
     if Path(path).suffix == ".nvdb":
         return nanovdb.contents(path)
     try:
@@ -119,30 +121,58 @@ def _contents(path: str | os.PathLike) -> tuple[Reader, dict[str, Any], list[str
         raise r.fail("it was written without grid offsets")
     r.take(36)
     r.metadata()
-    held, others = {}, []
+    held: dict[str, _Held] = {}
+    others: list[str] = []
+    damage = None
     for _ in range(r.number("I")):
-        grid_name, kind, instance = r.string().split("\x1e")[0], r.string(), r.string()
-        position, block, end = (r.number("q") for _ in range(3))
-        if not r.at <= position <= block <= end <= len(r.data):  # else a grid could end where it begins, for ever
-            raise r.fail(f"the grid {grid_name} says it lies at bytes {position} to {end} of {len(r.data)}")
-        channels = 1 if kind.startswith("Tree_float_5_4_3") else 3 if kind.startswith("Tree_vec3s_5_4_3") else 0
-        if channels and not instance:
-            r.at = position + 4
-            said = r.metadata().get("class", b"").decode("utf-8", "replace")
-            held.setdefault(grid_name, _Held(position, kind.endswith("_HalfFloat"), channels, said))
+        try:
+            name, one, end = _listed(r)
+        except InputError as error:  # where the next one begins is not known
+            damage = damage or error
+            break
+        if one is None:
+            others.append(name)
         else:
-            others.append(grid_name)
+            name = unused(name, held)
+            held[name] = one
+            try:
+                r.at = one.position + 4
+                held[name] = one._replace(kind=r.metadata().get("class", b"").decode("utf-8", "replace"))
+            except InputError as error:
+                damage = damage or error
         r.at = end
-    return r, held, others
+    return Contents(r, held, others, damage)
+
+
+def _listed(r: Reader) -> tuple[str, _Held | None, int]:
+    """(name, where it lies, its end) of the next grid; None for one of another type, or that shares another one's tree."""
+    name, kind, instance = _label(r.string()), r.string(), r.string()
+    position, block, end = (r.number("q") for _ in range(3))
+    if not r.at <= position <= block <= end <= len(r.data):  # else a grid could end where it begins, for ever
+        raise r.fail(f"the grid {name} says it lies at bytes {position} to {end} of {len(r.data)}")
+    channels = 1 if kind.startswith("Tree_float_5_4_3") else 3 if kind.startswith("Tree_vec3s_5_4_3") else 0
+    known = channels and not instance
+    return name, _Held(position, kind.endswith("_HalfFloat"), channels, "") if known else None, end
+
+
+def _label(unique: str) -> str:
+    """A grid's name as OpenVDB's tools show it: of several of one name those after the first have their number, "density[1]",
+    and grids without a name are "[0]", "[1]", ..."""
+    name, numbered, number = unique.partition("\x1e")
+    return f"{name}[{number}]" if numbered and (number != "0" or not name) else name or "[0]"
 
 
 def _read(path: str | os.PathLike, name: str | None, density: bool) -> tuple[Any, ...]:
     """(name, names of other float grids, tree, voxel size, origin, metadata)."""
-    r, held, unknown = _contents(path)
+    found = _contents(path)
+    r, held = found.reader, found.grids
+    name = name if name is None else found.called(name)
     grids = [n for n, h in held.items() if h.channels == 1 or n == name]
-    others = unknown + [n for n in held if n not in grids]
+    others = found.others + [n for n in held if n not in grids]
     likely = [n for n in grids if held[n].kind != LEVEL_SET] or grids
     chosen = name if name is not None else "density" if "density" in grids else next(iter(likely), "")
+    if found.damage and (chosen not in grids or (name is None and chosen != "density")):
+        raise found.damage
     if chosen not in grids:
         said = f"the float grids {', '.join(grids)}" if grids else "no float grid"
         said += f" and {', '.join(others)} of other kinds" if others else ""
@@ -153,7 +183,7 @@ def _read(path: str | os.PathLike, name: str | None, density: bool) -> tuple[Any
     else:
         r.at = held[chosen].position
         flags, metadata = r.number("I"), r.metadata()
-        voxel_size, origin = _read_transform(r)
+        voxel_size, origin = _read_transform(r, chosen)
         if r.number("I") != 1:
             raise r.fail("its tree has several buffers")
         tree = Tree(r, flags, held[chosen].half, channels)
@@ -166,7 +196,7 @@ def _read(path: str | os.PathLike, name: str | None, density: bool) -> tuple[Any
     return chosen, tuple(n for n in grids if n != chosen), tree, voxel_size, origin, metadata
 
 
-def _read_transform(r: Reader) -> tuple[np.ndarray, np.ndarray]:
+def _read_transform(r: Reader, grid: str) -> tuple[np.ndarray, np.ndarray]:
     kind = r.string()
     if kind in ("UniformScaleMap", "ScaleMap"):
         return r.numbers("<f8", 15)[:3], np.zeros(3)
@@ -178,6 +208,10 @@ def _read_transform(r: Reader) -> tuple[np.ndarray, np.ndarray]:
     if kind == "AffineMap":
         matrix = r.numbers("<f8", 16).reshape(4, 4)  # row vectors: p' = p M
         if np.abs(matrix[:3, :3] - np.diag(np.diag(matrix[:3, :3]))).max() > 1e-12:
-            raise r.fail("its transform rotates")
+            raise r.fail(f"the transform of its grid {grid} rotates")
         return np.diag(matrix)[:3], matrix[3, :3]
-    raise r.fail(f"its transform is a {kind}")
+    if kind == "NonlinearFrustumMap":
+        raise r.fail(
+            f"the voxels of its grid {grid} lie in a camera's frustum, wider the farther they are: resample it to even voxels"
+        )
+    raise r.fail(f"the transform of its grid {grid} is a {kind}")

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from typing import Any
+from collections.abc import Collection
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,6 +63,29 @@ class Reader:
             self.string()
             entries[name] = self.take(self.number("I"))
         return entries
+
+
+class Contents(NamedTuple):
+    """grids: of floats and vectors, by name. others: names of what else there is. damage: of the first grid whose head or place
+    is damaged; then nobody knows which of the grids somebody meant who names none, and later ones may not be listed."""
+
+    reader: Reader
+    grids: dict[str, Any]
+    others: list[str]
+    damage: InputError | None = None
+
+    def called(self, name: str) -> str:
+        """A grid's name here; the first of several of one name may be asked for by its number, as OpenVDB's tools do."""
+        first = name.removesuffix("[0]")
+        return first if name not in self.grids and first in self.grids else name
+
+
+def unused(name: str, taken: Collection[str]) -> str:
+    """A grid's name, with a number where an earlier one of the file has it."""
+    base, number, free = "" if name == "[0]" else name, 0, name
+    while free in taken:
+        number, free = number + 1, f"{base}[{number + 1}]"
+    return free
 
 
 class Tree:

@@ -58,6 +58,13 @@ class Volume:
         return heat * blackbody.glow(np.linspace(0.0, self.hottest or kelvin, 256).clip(1.0), kelvin)
 
 
+def is_turned(up: str) -> bool:
+    """Whether a file whose axis ``up`` is upright is to be turned; InputError where that is neither y nor z."""
+    if up not in ("y", "z"):
+        raise InputError(f"expected up to be y or z, got {up}")
+    return up == "y"
+
+
 def _upright(v: Any) -> Any:
     if v is None or isinstance(v, Sparse):
         return v and v.upright()
@@ -82,7 +89,12 @@ def open_volume(path: str | os.PathLike, uses: Collection[str] = ("colour", "hea
     wanted["heat"] = [n for n in TEMPERATURE + FLAME if held.get(n) == 1][:1]
     taken = []
     for what, name in ((use, name) for use in uses for name in wanted[use]):
-        other = read_blocks(given, name)
+        try:
+            other = read_blocks(given, name)
+        except InputError as error:
+            said = f"{name} cannot be read and is left out: {error}"
+            warnings.warn(f"{given}: {said}", RenderWarning, stacklevel=2)
+            continue
         if other is None or not np.allclose(other.voxel_size, found.voxel_size) or np.any(other.origin != found.origin):
             warnings.warn(
                 f"{given}: {name} lies on another grid than {found.name} and is left out", RenderWarning, stacklevel=2

@@ -58,7 +58,7 @@ MUTANTS = (
     M("nerfvol/cameras/calibration.py", "fx = self.fx * sx if", "fx = self.fx if", PEOPLE, "the focal length of resized pictures"),
     # ---------------------------------------------------------------- datasets
     M("nerfvol/datasets/colours.py", "known = 1 / gamma if", "known = gamma if", "datasets/test_colours.py", "a PNG's gamma the wrong way round"),
-    M("nerfvol/datasets/colours.py", "light[rows] @ _ADOBE.T", "light[rows] @ _ADOBE", "datasets/test_colours.py", "Adobe RGB's primaries transposed"),
+    M("nerfvol/datasets/colours.py", "np.array(self.matrix, np.float32).T", "np.array(self.matrix, np.float32)", "datasets/test_colours.py", "primaries transposed"),
     M("nerfvol/datasets/colours.py", "made.putalpha(whole.getchannel(\"A\"))", "pass", "datasets/test_colours.py", "grey with a profile loses its transparency"),
     M("nerfvol/datasets/images.py", "_pixels(image, path, as_stored=True)", "_pixels(image, path)", "datasets/test_colours.py", "masks are converted as colours are"),
     M("nerfvol/datasets/colours.py", "if _space(profile) in (\"RGB\", \"GRAY\") and _is_srgb(profile):", "if False:", "datasets/test_colours.py", "sRGB's own profile changes bits"),

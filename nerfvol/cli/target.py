@@ -15,8 +15,8 @@ from nerfvol.files.run_folder import model_path
 
 if TYPE_CHECKING:
     from nerfvol.cameras.camera import Camera
-    from nerfvol.datasets.dataset import Dataset
     from nerfvol.models import Model
+    from nerfvol.region import SceneBounds
 
 
 @dataclass(frozen=True)
@@ -35,22 +35,23 @@ class Target:
         stored = self.model.metadata.get("orbit")
         if isinstance(stored, dict) and {"center", "radius", "elevation_deg"} <= stored.keys():
             return _checked(stored, self.path)
-        if dataset := self._dataset():
-            return describe_orbit(dataset.cameras, dataset.scene.aabb)
+        if found := self._cameras():
+            return describe_orbit(found[0], found[1].aabb)
         return default_orbit(self.model.aabb())
 
     def training_cameras(self) -> Sequence[Camera]:
         """Those of the run's data; none where the run says no data or they are gone."""
-        dataset = self._dataset()
-        return [] if dataset is None else dataset.cameras
+        found = self._cameras()
+        return found[0] if found else []
 
-    def _dataset(self) -> Dataset | None:
+    def _cameras(self) -> tuple[list[Camera], SceneBounds] | None:
+        """Those of the run's training views, whose pictures nobody asked for, and where its scene is."""
         data = run_settings(self.name).get("data")
         if not data or not Path(data).exists():
             return None
-        from nerfvol.datasets.load import load_dataset
+        from nerfvol.datasets.load import dataset_cameras
 
-        return load_dataset(data, "train")
+        return dataset_cameras(data, "train")
 
 
 _RANGES: dict[str, tuple[float, float]] = {

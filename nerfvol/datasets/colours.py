@@ -1,7 +1,8 @@
 """Which colours a picture's numbers stand for. Models are made of sRGB; what states other colours is converted to it.
 
-A file states them by an ICC profile (Display P3 of phones, Adobe RGB of cameras, inks), by a PNG's gamma, or as cameras mark
-Adobe RGB in EXIF. A profile that maps colours as sRGB does, whatever its name, changes no bit. Sources: docs/data.md.
+A file states them by an ICC profile (Display P3 of phones, Adobe RGB of cameras, inks), by a PNG's code points, gamma and
+primaries (primaries.py), or as cameras mark Adobe RGB in EXIF. A profile that maps colours as sRGB does, whatever
+its name, changes no bit. Sources: docs/data.md.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from nerfvol.datasets.primaries import UNSPECIFIED, Matrix, code_points, is_srgb, named, to_srgb
+
 SAME = 2
 """Levels of 255 by which a profile's colours may differ from sRGB's and still be those: profiles are rounded."""
 _PNG_GAMMA, _NEAR = 1 / 2.2, 0.03
 _GAMMAS = (0.1, 10)
 """Beyond which a PNG's gamma is a mistake: it would make pictures black or white."""
-_ADOBE = np.array([[1.39835574, -0.39835574, 0.0], [0.0, 1.0, 0.0], [0.0, -0.04292933, 1.04292933]], np.float32)
+_ADOBE = ((1.39835574, -0.39835574, 0.0), (0.0, 1.0, 0.0), (0.0, -0.04292933, 1.04292933))
 """Linear Adobe RGB (1998) to linear sRGB: both have D65's white and, but for green, the same primaries."""
 _ADOBE_GAMMA = 2.19921875
 _FINE = 1 << 14
@@ -32,49 +35,68 @@ _EXIF_DETAILS, _EXIF_COLOURS, _EXIF_INTEROP = 0x8769, 0xA001, 0xA005
 @dataclass(frozen=True)
 class Colours:
     """Colours that are not sRGB's. ``name``: for sentences. ``profile``: ICC; else values to the power ``gamma`` are linear
-    light, of Adobe RGB's primaries or sRGB's. No conversion is known where both are None."""
+    light, which ``matrix`` makes sRGB's; without a gamma their curve is sRGB's. None of the three: no conversion
+    is known."""
 
     name: str
     profile: bytes | None = None
     gamma: float | None = None
-    is_adobe: bool = False
+    matrix: Matrix | None = None
 
     @property
     def is_known(self) -> bool:
         """Whether pictures can be converted."""
-        return self.profile is not None or self.gamma is not None
+        return not (self.profile is None and self.gamma is None and self.matrix is None)
 
     def to_srgb(self, image: Image.Image) -> Image.Image:
         """The picture as RGB or RGBA in sRGB; as it is where no conversion is known."""
         if self.profile is not None:
             return _by_profile(self.profile, image)
-        if self.gamma is None:
+        if not self.is_known:
             return image
-        pixels = np.array(_plain(image))
-        light = ((np.arange(256) / 255) ** self.gamma).astype(np.float32)
-        if not self.is_adobe:
+        pixels, values = np.array(_plain(image)), np.arange(256) / 255
+        light = (_decoded(values) if self.gamma is None else values**self.gamma).astype(np.float32)
+        if self.matrix is None:
             pixels[..., :3] = _encoded(light)[pixels[..., :3]]
             return Image.fromarray(pixels)
+        matrix = np.array(self.matrix, np.float32).T
         band = max(1, (1 << 16) // pixels.shape[1])  # rows whose floats stay in the processor's cache
         for top in range(0, len(pixels), band):
             rows = pixels[top : top + band, :, :3]
-            mixed = light[rows] @ _ADOBE.T
+            mixed = light[rows] @ matrix
             rows[:] = _fine_encoded()[(np.clip(mixed, 0, 1) * _FINE + np.float32(0.5)).astype(np.int32)]
         return Image.fromarray(pixels)
 
 
 def colours_of(image: Image.Image) -> Colours | None:
     """The colours of an opened picture, from its header alone; None where they are sRGB's, or nothing is stated."""
+    codes = code_points(image)
+    if codes is not None and codes[:2] != (UNSPECIFIED, UNSPECIFIED):  # goes before all others
+        found = named(codes)
+        return found and Colours(found[0], gamma=found[1], matrix=found[2])
     profile = image.info.get("icc_profile")
     if isinstance(profile, bytes) and profile:
         return _of_profile(profile, image.mode)
-    gamma = image.info.get("gamma")
-    if image.format == "PNG" and isinstance(gamma, float) and gamma > 0 and "srgb" not in image.info:
-        known = 1 / gamma if _GAMMAS[0] <= gamma <= _GAMMAS[1] else None
-        return None if abs(gamma - _PNG_GAMMA) < _NEAR else Colours(f"a gamma of {gamma:.3g}", gamma=known)
+    if image.format == "PNG" and "srgb" not in image.info:
+        return _of_numbers(image.info.get("gamma"), image.info.get("chromaticity"))
     if image.format in ("JPEG", "MPO") and "exif" in image.info and _says_adobe(image):
-        return Colours("Adobe RGB, by EXIF", gamma=_ADOBE_GAMMA, is_adobe=True)
+        return Colours("Adobe RGB, by EXIF", gamma=_ADOBE_GAMMA, matrix=_ADOBE)
     return Colours("inks (CMYK) without a profile") if image.mode == "CMYK" else None
+
+
+def _of_numbers(gamma: Any, places: Any) -> Colours | None:
+    """Of a PNG's gAMA and cHRM."""
+    name, known = "", None
+    if isinstance(gamma, float) and gamma > 0 and abs(gamma - _PNG_GAMMA) >= _NEAR:
+        name, known = f"a gamma of {gamma:.3g}", 1 / gamma
+        if not _GAMMAS[0] <= gamma <= _GAMMAS[1]:
+            return Colours(name)
+    if not isinstance(places, tuple) or is_srgb(places):
+        return Colours(name, gamma=known) if name else None
+    red = f"{places[2]:.3g} {places[3]:.3g}"
+    name = f"{name} and " * bool(name) + f"primaries of their own (red at {red}, by cHRM)"
+    matrix = to_srgb(places)
+    return Colours(name) if matrix is None else Colours(name, gamma=known, matrix=matrix)
 
 
 def _says_adobe(image: Image.Image) -> bool:
@@ -90,6 +112,11 @@ def _says_adobe(image: Image.Image) -> bool:
 @functools.cache
 def _fine_encoded() -> NDArray[np.uint8]:
     return _encoded(np.arange(_FINE + 1) / _FINE)
+
+
+def _decoded(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """sRGB's values in [0, 1] as linear light."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def _encoded(light: NDArray[np.floating]) -> NDArray[np.uint8]:

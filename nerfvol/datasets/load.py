@@ -22,7 +22,7 @@ from nerfvol.datasets.holdout import HOLDOUTS, hold_out_arc
 from nerfvol.datasets.images import UInt8, map_threads
 from nerfvol.datasets.kinds import KINDS, Decision, Evidence, decide, look
 from nerfvol.datasets.listing import Frame, Listing, listed_names, named
-from nerfvol.datasets.odd_ones import blank, dim
+from nerfvol.datasets.odd_ones import blank, dim, thumbnails
 from nerfvol.datasets.sampled import Sampled, sample, seen_small
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError, shown
@@ -155,6 +155,7 @@ def _find(
     frames = _present(listing, messages)
     training = [f for f in listing.training if f.path is not None] or frames
     views, training_views = views_of(frames, training, listing.source, messages, threads)
+    views, training_views = thumbnails(training_views, views, downscale, messages)
     if most is not None and len(views) > most:
         views = [views[i] for i in evenly(len(views), most)]
     views = with_common_masks(views, training_views, messages)

@@ -18,6 +18,11 @@ DIM = 24
 """Of 255 levels: no photograph is so dark throughout, and 12 bits in a file for 16 reach 15."""
 OTHER_LENS = 20
 """Times: focal lengths, in widths of the picture, that differ by more from the middle one are a mistake and no zoom."""
+THUMBNAIL = 25
+"""Times that the middle one of the pictures' longer sides holds a thumbnail's shorter one, at least: training reduces pictures
+together, until some hundred pixels are left along their longer side, and so of a thumbnail at most four, or none."""
+LEAST_SIDE = 16
+"""Pixels: what is smaller is a thumbnail too, where the others are much larger; the first stages see 1 / 16 of pictures."""
 
 
 def alone(views: Sequence[View], messages: list[str]) -> set[int]:
@@ -59,6 +64,31 @@ def astray(training: Sequence[View], views: Sequence[View]) -> set[int]:
         if len(group):
             found |= {id(view) for view, far in zip(group, crowd.astray(positions), strict=True) if far}
     return found
+
+
+def thumbnails(
+    training: Sequence[View], views: Sequence[View], downscale: int, messages: list[str]
+) -> tuple[list[View], list[View]]:
+    """Both without the pictures that, 1 / downscale of their size, are too small to be reduced together with the others; a
+    sentence on those of ``views``. Where all of these are so small they stay."""
+    usual = float(np.median([_longer(view) for view in training])) / downscale
+    least = max(usual / THUMBNAIL, LEAST_SIDE)
+
+    def is_large(view: View) -> bool:
+        lens = view.camera.intrinsics
+        return min(lens.width, lens.height) // downscale >= least or 4 * _longer(view) >= usual * downscale
+
+    kept, small = [v for v in views if is_large(v)], [v for v in views if not is_large(v)]
+    if small and kept:
+        messages.append(
+            f"{len(small)} of {len(views)} images are thumbnails, less than {least * downscale:.0f} pixels to a side where the "
+            f"others have {usual * downscale:.0f}: they are left out: {named([view.frame.listed for view in small])}"
+        )
+    return kept or list(views), [view for view in training if is_large(view)]
+
+
+def _longer(view: View) -> int:
+    return max(view.camera.intrinsics.width, view.camera.intrinsics.height)
 
 
 def blank(views: Sequence[View], images: Sequence[UInt8], messages: list[str]) -> set[int]:

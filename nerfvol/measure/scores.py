@@ -46,10 +46,10 @@ def score_views(
 ) -> dict[str, Any]:
     """Scores of ``render`` (camera -> (H, W, 3) float32) against every image of ``dataset`` over ``background``.
 
-    Returns psnr and ssim (means of the per-view values), seconds_per_frame (median) and rows with name, psnr, ssim and
-    seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that masks leave out,
-    or that the lens does not reach, take no part; views of which nothing is left have no row. ``colour_fit``: also
-    psnr_fitted and ssim_fitted, of the render after the colour map that brings it nearest to the photograph
+    Returns psnr and ssim (means of the per-view values), seconds_per_frame (median, without the first) and rows with name,
+    psnr, ssim and seconds. Renders are clipped to [0, 1] first. ``on_view(index, truth, render)`` sees each pair. Pixels that
+    masks leave out, or that the lens does not reach, take no part; views of which nothing is left have no row. ``colour_fit``:
+    also psnr_fitted and ssim_fitted, of the render after the colour map that brings it nearest to the photograph
     (measure.colour_fit): without what the camera's exposure and white balance do. ``fitted``: cameras whose poses were fitted
     to the model (measure.pose_fit): also psnr_posed and ssim_posed, seen from there, and the colour fit is made there.
     """
@@ -107,11 +107,11 @@ def score_view(
 
 
 def summarised(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """What :func:`score_views` returns of its rows."""
+    """What :func:`score_views` returns of its rows. The first view also made what all share, so that its time is no frame's."""
     means = [name for name in MEANS if name in rows[0]]
     return {
         **{name: statistics.fmean(row[name] for row in rows) for name in means},
-        "seconds_per_frame": statistics.median(row["seconds"] for row in rows),
+        "seconds_per_frame": statistics.median(row["seconds"] for row in rows[1:] or rows),
         "rows": rows,
     }
 

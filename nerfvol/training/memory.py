@@ -333,9 +333,11 @@ class OctreePlan:
     Attributes: max_leaves, a bound on splitting; foreground_tiles, about so many training tiles show more than the background.
     """
 
-    def __init__(self, config: Config, dataset: Dataset, held_out_bytes: int, splats: int = 0, leaves: int = 0) -> None:
+    def __init__(
+        self, config: Config, dataset: Dataset, held_out_bytes: int, splats: int = 0, leaves: int = 0, grows: bool = False
+    ) -> None:  # fmt: skip
         """``splats``: bytes next to the program while splats are trained that it comes from, and become an octree of at most
-        about ``leaves`` leaves; 0: there are none.
+        about ``leaves`` leaves; 0: there are none. ``grows``: whether its stages split these.
 
         Raises:
             InputError: not even a coarse octree fits in the memory at hand.
@@ -347,7 +349,7 @@ class OctreePlan:
         self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp", splats=splats)
         self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)
-        wanted = leaves if leaves and dataset.scene.is_unbounded else max(wanted, leaves)
+        wanted = leaves if leaves and not grows else max(wanted, leaves)
         self.max_leaves = affordable_leaves(dataset, self._degree, least=min(wanted, 1 << 18), other=self._other)
         self._announced = min(wanted, self.max_leaves)
 

@@ -167,7 +167,8 @@ def begin_octree(run: Run) -> OctreeTrainer:
     data = run.data
     splats = planned_splats(run) if run.config.init == "splats" and run.phase in ("start", "splats") else None
     bytes_of_splats, leaves = (splats.bytes, splats.leaves) if splats is not None else (0, 0)
-    plan = OctreePlan(run.config, data.training, data.held_out_bytes, bytes_of_splats, leaves)
+    grows = splats is not None and splats.stage is None
+    plan = OctreePlan(run.config, data.training, data.held_out_bytes, bytes_of_splats, leaves, grows)
     announce(run, plan.sentence())
     photographs = data.training.scene.is_unbounded
     if run.config.init != run.given.init and (chosen := why_start(run.config, len(data.training), photographs)):

@@ -19,14 +19,14 @@ def kill(folder: Path, seed: int, first: str, command: str, names: str) -> None:
     """Runs the command (killing.py); then each folder has of ``names`` what the undisturbed one has, and nothing half."""
     script = [sys.executable, "tests/cli/killing.py", str(seed), first, str(folder), *command.split()]
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    done = subprocess.run(script, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(script, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr[-2000:]
     assert int(done.stdout.split()[-1]) >= 1
     whole, *others = (
-        {p.relative_to(folder / name): p.read_bytes() for p in (folder / name).rglob(names) if p.is_file()}
-        for name in ("whole", "killed_1", "killed_2")
+        {p.relative_to(run): p.read_bytes() for p in run.rglob(names) if p.is_file()}
+        for run in (folder / "whole", *folder.glob("killed_*"))
     )
-    assert whole and all(other == whole for other in others)
+    assert whole and len(others) >= 2 and all(other == whole for other in others)
     assert not list(folder.rglob(".*.tmp*"))
 
 

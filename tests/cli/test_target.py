@@ -7,14 +7,18 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from nerfvol.cameras.paths import orbit_cameras
+from nerfvol.cameras.paths import describe_orbit, orbit_cameras
 from nerfvol.cli.target import open_target
+from nerfvol.datasets import decoding
+from nerfvol.datasets.load import load_dataset
 from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
+from nerfvol.files.run_folder import CONFIG
 from nerfvol.models import load_model
 from nerfvol.octree.io import save_octree
 from nerfvol.splats.io import save_splats
 from nerfvol.splats.splats import Splats
+from tests.fixtures.tiny import write_scene
 
 ORBIT = {"center": [0.5, 0.5, 0.5], "radius": 2.0, "elevation_deg": 20.0, "up": [0, 0, 1], "size": [16, 16]}
 MANY = "9" * 5000
@@ -45,6 +49,24 @@ def test_an_orbit_without_its_middle_or_radius_is_refused(sphere_octree, tmp_pat
     save_octree(tmp_path / "a.safetensors", sphere_octree, {"orbit": ORBIT | {name: None}})
     with pytest.raises(InputError, match=f"its orbit's {name} is None"):
         open_target(str(tmp_path / "a.safetensors")).orbit()
+
+
+def test_where_a_run_was_seen_from_is_asked_of_its_cameras_and_no_picture_is_decoded(
+    sphere_octree, tmp_path, monkeypatch
+):
+    """Of all that were trained on, not only of those that are looked at to tell what kind of scene it is."""
+    write_scene(tmp_path / "scene", {"train": 30}, size=20)
+    path = tmp_path / "octree.safetensors"
+    save_octree(path, sphere_octree, {})
+    (tmp_path / CONFIG).write_text(json.dumps({"data": str(tmp_path / "scene")}))
+    dataset = load_dataset(tmp_path / "scene", "train")
+    monkeypatch.setattr(decoding, "read_pixels", None)
+    target = open_target(str(path))
+    assert target.orbit() == describe_orbit(dataset.cameras, dataset.scene.aabb)
+    cameras = target.training_cameras()
+    assert len(cameras) == 30
+    for camera, other in zip(cameras, dataset.cameras, strict=True):
+        np.testing.assert_array_equal(camera.c2w, other.c2w)
 
 
 def test_thousands_of_digits_are_not_repeated(sphere_octree, tmp_path):

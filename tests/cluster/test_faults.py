@@ -84,7 +84,7 @@ def test_any_number_of_workers_and_frames_a_task_makes_the_same_bytes(
 
 def restored(client) -> None:
     """Waits until two workers are there again, and none of them is to die."""
-    for _ in range(100):
+    for _ in range(1000):
         with contextlib.suppress(OSError):  # the scheduler has yet to see that one is gone
             if len(client.run(die_once_in, "", "")) == 2:
                 return
@@ -119,14 +119,22 @@ def test_a_worker_killed_in_any_phase_loses_nothing_and_does_nothing_twice(
 
 
 @pytest.mark.parametrize("copies", (True, False), ids=("copies", "processes"))
-def test_when_the_only_worker_is_killed_its_successor_goes_on(copies, monkeypatch):
+def test_when_the_only_worker_is_killed_its_successor_goes_on(copies, monkeypatch, tmp_path):
     """The scheduler does not look again at tasks that nobody could take when a worker it knows becomes fit; and nothing is late
     while nobody knows how long a task takes."""
     monkeypatch.setattr(engine, "may_copy", lambda: copies)
     with connect("local:1") as found:
-        window = Window(found, Job("tests.cluster.work:double", {"seconds": 0.8}), Needs())
+        found.wait_for_workers(1, timeout=600)
         (process,) = cast(dict[str, int], found.run(os.getpid)).values()
-        threading.Timer(0.4, os.kill, (process, signal.SIGKILL)).start()
+        held = {"process": process, "begun": str(tmp_path / "begun")}
+        window = Window(found, Job("tests.cluster.work:held", held), Needs())
+
+        def kill() -> None:
+            while not (tmp_path / "begun").exists():
+                time.sleep(0.01)
+            os.kill(process, signal.SIGKILL)
+
+        threading.Thread(target=kill, daemon=True).start()
         results = list(window.results(range(3)))
     assert [value for value, _ in results] == [0, 2, 4]
     assert process not in {who for _, who in results}
@@ -139,12 +147,12 @@ def test_a_client_that_was_killed_goes_on_with_the_same_command(model, expected,
     )
     command = [sys.executable, "-c", code, str(model), str(tmp_path)]
     first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while len(list(tmp_path.glob("0*.png"))) < 4:
-        assert first.poll() is None
+    while len(list(tmp_path.glob("0*.png"))) < 4 and first.poll() is None:
         time.sleep(0.01)
     first.kill()
     first.wait()
     there = len(list(tmp_path.glob("0*.png")))
+    assert there >= 4
     second = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert second.returncode == 0 and int(second.stdout) == FRAMES - there
     assert contents(tmp_path) == expected
@@ -179,11 +187,11 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
         pytest.skip(f"these kernels are {ops.isa()}: there is nothing to tell them from")
     with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
         worker(NERFVOL_ISA="baseline")
-        found.wait_for_workers(1, timeout=60)
+        found.wait_for_workers(1, timeout=600)
         with pytest.raises(InputError, match=r"is fit after 3 s \(tcp://.*with baseline kernels.*draws other pictures"):
             fit.welcome(found, Needs(patience=3.0))
         worker()
-        found.wait_for_workers(2, timeout=60)
+        found.wait_for_workers(2, timeout=600)
         resource, messages = fit.welcome(found, Needs())
         assert len(messages) == 1 and "with baseline kernels" in messages[0]
         assert len(fit.fit_workers(found, resource)) == 1
@@ -207,14 +215,14 @@ def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
     absent = "import sys; sys.modules['nerfvol'] = None; "
     with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
         worker(before=absent)
-        found.wait_for_workers(1, timeout=60)
+        found.wait_for_workers(1, timeout=600)
         (stranger,) = found.scheduler_info(n_workers=-1)["workers"]
         with pytest.raises(
             InputError, match=rf"is fit after 2 s \({stranger}: nerfvol cannot be used there \(ModuleNotF"
         ):
             fit.welcome(found, Needs(patience=2.0))
         worker()
-        found.wait_for_workers(2, timeout=60)
+        found.wait_for_workers(2, timeout=600)
         window = Window(found, Job("tests.cluster.work:double", {}), Needs())
         assert [
             said for said in window.messages if said.startswith(f"{stranger} does not work on this: nerfvol cannot")
@@ -226,10 +234,10 @@ def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
 def test_a_worker_that_joins_late_works_too(tmp_path):
     with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
         worker()
-        results = Window(found, Job("tests.cluster.work:double", {"seconds": 0.05}), Needs()).results(range(2000))
+        results = Window(found, Job("tests.cluster.work:double", {"seconds": 0.05}), Needs()).results(range(100_000))
         seen = {next(results)[1]}
         worker()
-        while len(seen) < 2:  # ends by the results' end at the latest
+        while len(seen) < 2:  # ends after more than an hour at the latest
             seen.add(next(results)[1])
         results.close()
 
@@ -261,14 +269,15 @@ def test_a_cache_on_a_full_file_system_leaves_the_work_to_others(client, tmp_pat
 
 
 def test_the_client_keeps_no_results(client):
-    """Once a window of results has come (six tasks of at most 64), 150 MB more leave this process as large as it was."""
+    """150 MB more than the first 50 leave this process as large as it was, but for what may be on its way: six tasks of at most
+    64, of which those that came early wait for an earlier one."""
     import psutil
 
     process, sizes = psutil.Process(), []
     for result in Window(client, Job("tests.cluster.work:noise", {"bytes": 100_000}), Needs()).results(range(2000)):
         assert len(result) == 100_000
         sizes.append(process.memory_info().rss)
-    assert max(sizes[500:]) - max(sizes[:500]) < 20e6
+    assert max(sizes[500:]) - max(sizes[:500]) < 6 * 64 * 100_000 + 20e6
 
 
 def test_nothing_is_said_and_no_warning_raised_beside_a_port_in_use(model, expected, tmp_path):
@@ -290,6 +299,8 @@ def test_processes_of_this_machine_listen_on_loopback_alone():
     import psutil
 
     with connect("local:2"):
-        ours = [psutil.Process(), *psutil.Process().children(recursive=True)]
-        listening = {c.laddr.ip for p in ours for c in p.net_connections("tcp") if c.status == "LISTEN"}
+        ours, listening = [psutil.Process(), *psutil.Process().children(recursive=True)], set()
+        for process in ours:
+            with contextlib.suppress(psutil.NoSuchProcess):  # it ended meanwhile
+                listening |= {c.laddr.ip for c in process.net_connections("tcp") if c.status == "LISTEN"}
     assert listening == {"127.0.0.1"}

@@ -13,6 +13,23 @@ def double(settings: dict, files: dict, item: int) -> tuple[int, int]:
     return 2 * item, os.getpid()
 
 
+def in_company(settings: dict, files: dict, item: int) -> int:
+    """2 item, once as many processes as settings["n"] have left their number in the folder settings["folder"]."""
+    folder = Path(settings["folder"])
+    (folder / str(os.getpid())).touch()
+    while len(list(folder.iterdir())) < settings["n"]:
+        time.sleep(0.01)
+    return 2 * item
+
+
+def held(settings: dict, files: dict, item: int) -> tuple[int, int]:
+    """As ``double``; the process settings["process"] makes the file settings["begun"] and never ends."""
+    if os.getpid() == settings["process"]:
+        Path(settings["begun"]).touch()
+        time.sleep(3600)
+    return 2 * item, os.getpid()
+
+
 def content(settings: dict, files: dict, item: int) -> bytes:
     """The bytes of the file "model"."""
     return Path(files["model"]).read_bytes()

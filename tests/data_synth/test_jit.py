@@ -125,7 +125,7 @@ def test_another_numba_compiles_in_its_own_way(monkeypatch):
         "from data_synth import jit\n"
         "print(jit.Compiler.__module__, jit.jit(lambda x: x).targetoptions['nogil'])"
     )
-    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, timeout=600)
     assert done.stdout.split() == ["numba.core.compiler", "True"], done.stderr[-500:]
 
 

@@ -125,6 +125,29 @@ def test_a_scene_file_has_it_and_truth_tells_it(tmp_path):
     assert np.array_equal(t["number"] == -1, level_sets.holds(solid, p)) and (t["number"] == -1).any()
 
 
+def test_what_is_upright_along_y_is_turned(tmp_path):
+    """A solid of the file at (x, y, z) is then at (x, -z, y): over several bricks, of another size along each axis."""
+    shape, lo, hi = (12, 30, 21), np.array([0.1, -1.0, 0.3]), np.array([1.2, 2.0, 2.5])
+    p = np.stack(np.meshgrid(*[np.linspace(a, b, n) for a, b, n in zip(lo, hi, shape, strict=True)], indexing="ij"), -1)
+    solid = level_sets.sampled(0, np.linalg.norm((p - [0.6, 0.2, 1.2]) / [0.3, 0.7, 0.5], axis=-1) - 1, lo, hi)
+    turned = level_sets.upright(solid)
+    points = np.random.default_rng(0).uniform(lo, hi, (4000, 3))
+    inside = level_sets.holds(solid, points)
+    assert 100 < inside.sum() < 3600
+    x, y, z = points.T
+    assert np.array_equal(level_sets.holds(turned, np.stack([x, -z, y], 1)), inside)
+
+    os.link(BALL, tmp_path / "ball.vdb")
+    made = []
+    for up in ("z", "y"):
+        (tmp_path / "s.yaml").write_text(YAML.replace("size: 2.0, centre: [0, 0, 0]", f"up: {up}"))
+        made += scene_file.load(tmp_path / "s.yaml").level_sets
+    assert made[1].lo == level_sets.upright(made[0]).lo != made[0].lo
+    (tmp_path / "s.yaml").write_text(YAML.replace("size: 2.0", "up: x, size: 2.0"))
+    with pytest.raises(InputError, match=r"shapes\[0\].level_set: expected up to be y or z, got x"):
+        scene_file.load(tmp_path / "s.yaml")
+
+
 def test_a_changed_solid_is_another_scene():
     scene = Scene(level_sets=[level_sets.level_set(0, BALL)], materials=[RED], lights=[lights.environment(1.0)])
     before = scene.fingerprint()

@@ -16,6 +16,6 @@ def test_in_plain_python(name):
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     command = [*"-m pytest -q -x -n 0 -p no:cacheprovider".split(), f"tests/data_synth/{name}"]
     done = subprocess.run(
-        [sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1800
     )
     assert done.returncode == 0, done.stdout[-3000:]

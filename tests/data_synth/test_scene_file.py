@@ -8,6 +8,7 @@ import yaml
 
 from data_synth import InputError, lights, materials, media, phase, scene_file, sggx, spongecake, surfaces
 from data_synth.cli import main
+from data_synth.vdb_write import write_vdb
 
 EVERYTHING = """
 name: all of it
@@ -69,6 +70,23 @@ def test_every_object_is_what_its_function_makes(tmp_path):
     assert np.array_equal(s.lights[3], lights.environment(0.5)) and len(s.lights) == 5
     assert s.bounded and s.opaque_sky and s.exposure == 0.5 and s.integrators == ("march", "path")
     assert s.viewpoints.radius == 5 and s.aabb[1, 2] == 2
+
+
+def test_a_volume_that_is_upright_along_y_is_turned(tmp_path):
+    """The file's y, of 3 samples, is z then, and its z, of 4, is -y; an array and a file of blocks alike."""
+    rho = np.arange(24.0, dtype=np.float32).reshape(2, 3, 4) + 1
+    np.savez(tmp_path / "v.npz", density=rho)
+    write_vdb(tmp_path / "v.vdb", rho, (1.0,) * 3, half=False)
+    for name in ("v.npz", "v.vdb"):
+        puff = load(
+            tmp_path, f"medium: {{volume: {{file: {name}, size: 3, centre: [0, 0, 1], up: y}}}}\nlights: [sun]"
+        ).medium
+        dense = media.dense(puff)
+        for x, y, z in np.ndindex(rho.shape):
+            assert dense[x, 3 - z, y] == rho[x, y, z] / np.float32(24)
+        assert np.allclose(puff.lo, (-0.5, -1.5, 0)) and np.allclose(puff.hi, (0.5, 1.5, 2))
+    with pytest.raises(InputError, match=r"medium.volume: expected up to be y or z, got up"):
+        load(tmp_path, "medium: {volume: {file: v.npz, up: up}}")
 
 
 def test_the_example_is_a_scene():

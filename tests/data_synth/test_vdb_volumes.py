@@ -1,5 +1,6 @@
 """OpenVDB, npz and raw volumes: round trips, a real file, hostile files."""
 
+import re
 import struct
 import zlib
 
@@ -10,9 +11,9 @@ from data_synth import media, scenes
 from data_synth.blosc import decompress
 from data_synth.bricks import bricks
 from data_synth.errors import InputError, RenderWarning
-from data_synth.vdb import Reader, Tree, read_vdb
+from data_synth.vdb import Reader, Tree, grid_names, read_vdb
 from data_synth.vdb_write import SparseGrid, write_grids, write_vdb
-from data_synth.volumes import read_volume, write_density
+from data_synth.volumes import open_volume, read_volume, write_density
 from tests.fixtures.real import real_data
 
 
@@ -264,6 +265,98 @@ def test_grids_by_name(tmp_path, names):
     assert np.all(read_volume(f"{path}:flame")[0] == names.index("flame") + 1.0)
     with pytest.raises(InputError, match="flame.*not smoke"):
         read_volume(f"{path}:smoke")
+
+
+def several(path, *names):
+    """Grids of eight voxels each, of value 1, 2, ...; names as OpenVDB writes them: of several alike each with its number."""
+    write_grids(
+        path, [SparseGrid(name, np.argwhere(np.ones((2, 2, 2))), np.full(8, k + 1.0)) for k, name in enumerate(names)]
+    )
+    return path
+
+
+@pytest.mark.parametrize("names, known", [
+    (("density\x1e0", "density\x1e1", "heat"), {"density": 1, "density[0]": 1, "density[1]": 2, "heat": 3}),
+    (("\x1e0", "\x1e1"), {"[0]": 1, "[1]": 2}),
+    (("", "heat"), {"[0]": 1, "heat": 2}),
+    (("a", "a", "a[1]"), {"a": 1, "a[0]": 1, "a[1]": 2, "a[1][1]": 3}),
+    (("", "", ""), {"[0]": 1, "[1]": 2, "[2]": 3}),
+])  # fmt: skip
+def test_several_grids_of_one_name_and_grids_without_one(tmp_path, names, known):
+    """As OpenVDB's tools call them."""
+    path = several(tmp_path / "a.vdb", *names)
+    for name, value in known.items():
+        assert read_vdb(path, name).values.max() == value, name
+    with pytest.warns(RenderWarning, match=re.escape(f"took the grid {next(iter(known))};")):
+        assert read_volume(path)[0].max() == 1
+    shown = known.keys() - {f"{name}[0]" for name in known}
+    assert grid_names(path) == (dict.fromkeys((n for n in known if n in shown), 1), ())
+
+
+def spoilt(path, name, what):
+    """Of a grid: the number of its metadata's entries, the place where it ends, or its values."""
+    data = bytearray(path.read_bytes())
+    kind = data.index(b"Tree_float_5_4_3", data.index(name))
+    places = kind + struct.unpack_from("<I", data, kind - 4)[0] + 4
+    start, block, _ = struct.unpack_from("<3q", data, places)
+    if what == "place":
+        data[places + 16 : places + 24] = struct.pack("<q", len(data) + 9)
+    elif what == "metadata":
+        data[start + 4 : start + 8] = b"\xff" * 4
+    elif what == "values":
+        data[start + 4 + 4 :] = data[start + 4 + 4 :].replace(b"ScaleTranslateMap", b"ScaleTranslateMop", 1)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("what", ["metadata", "values", "place"])
+def test_a_damaged_grid_is_no_harm_to_the_others(tmp_path, what):
+    """Whoever names none gets the density where that is whole; else nobody knows which was meant. Where a grid's place is
+    damaged, those after it are not found."""
+    path = several(tmp_path / "a.vdb", "first", "density", "heat", "last")
+    whole = path.read_bytes()
+    spoilt(path, b"heat", what)
+    assert read_vdb(path, "first").values.max() == 1
+    assert read_vdb(path).values.max() == 2
+    with pytest.raises(InputError, match=r"a\.vdb: expected an OpenVDB"):
+        read_vdb(path, "heat")
+    if what == "place":
+        with pytest.raises(InputError, match="the grid heat says it lies at"):
+            read_vdb(path, "last")
+    else:
+        assert read_vdb(path, "last").values.max() == 4
+    path.write_bytes(whole)
+    spoilt(path, b"density", what)
+    with pytest.raises(InputError, match=r"a\.vdb: expected an OpenVDB"):
+        read_vdb(path)
+    assert read_vdb(path, "first").values.max() == 1
+
+
+def test_a_damaged_grid_of_colour_is_left_out(tmp_path):
+    path = several(tmp_path / "a.vdb", "density", "temperature")
+    spoilt(path, b"temperature", "values")
+    with pytest.warns(RenderWarning) as told:
+        volume = open_volume(path)
+    assert volume.heat is None and volume.density.max() == 1
+    assert "temperature cannot be read and is left out" in str(told[0].message)
+
+
+@pytest.mark.parametrize("kind, message", [
+    (b"NonlinearFrustumMap", "its grid density lie in a camera's frustum"),
+    (b"UnitaryMap", "transform of its grid density is a Unit"),
+])  # fmt: skip
+def test_transforms_that_are_no_scale_are_named(tmp_path, kind, message):
+    path = several(tmp_path / "a.vdb", "density")
+    usual = struct.pack("<I", 17) + b"ScaleTranslateMap"
+    data = path.read_bytes()
+    assert data.count(usual) == 1
+    place = data.index(b"Tree_float_5_4_3")
+    at = place + struct.unpack_from("<I", data, place - 4)[0] + 4
+    more = len(kind) - 17
+    places = [n + d for n, d in zip(struct.unpack_from("<3q", data, at), (0, more, more), strict=True)]
+    data = data[:at] + struct.pack("<3q", *places) + data[at + 24 :]
+    path.write_bytes(data.replace(usual, struct.pack("<I", len(kind)) + kind))
+    with pytest.raises(InputError, match=message):
+        read_vdb(path)
 
 
 @pytest.mark.parametrize("arrays, message", [

@@ -126,6 +126,86 @@ def test_a_png_says_its_gamma(tmp_path):
         assert np.abs(read_image(save(tmp_path / "a.png", pnginfo=info)) - expected).max() <= 0.51
 
 
+BT2020 = np.array([[0.67348, 0.16566, 0.12505], [0.27904, 0.67535, 0.04561], [-0.00193, 0.02998, 0.79686]])
+
+
+def chunks(*pairs):
+    info = PngImagePlugin.PngInfo()
+    for name, data in pairs:
+        info.add(name, data)
+    return info
+
+
+def places(*values) -> tuple[bytes, bytes]:
+    return b"cHRM", struct.pack(">8I", *(round(100000 * v) for v in values))
+
+
+def of_curve(values):
+    """As ``srgb_of`` takes them with a power of 1: sRGB's values as light, 0 to 255."""
+    v = values / 255.0
+    return 255 * np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+@pytest.mark.parametrize(("codes", "expected"), [
+    ((1, 13, 0, 1), COLOURS), ((1, 1, 0, 1), COLOURS), ((2, 13, 0, 1), COLOURS),
+    ((12, 13, 0, 1), srgb_of(of_curve(COLOURS), P3, 1.0)), ((9, 14, 0, 1), srgb_of(of_curve(COLOURS), BT2020, 1.0)),
+    ((12, 4, 0, 1), srgb_of(COLOURS, P3, 2.2)), ((1, 8, 0, 1), srgb_of(COLOURS, SRGB, 1.0)),
+])  # fmt: skip
+def test_a_pngs_code_points_go_before_all_else(tmp_path, codes, expected):
+    """ITU-T H.273: Display P3 is 12, BT.2020 9, sRGB's curve 13, the power of 2.2 is 4, light itself 8."""
+    info = chunks((b"gAMA", (30000).to_bytes(4, "big")), (b"cICP", bytes(codes)))
+    path = save(tmp_path / "a.png", pnginfo=info, icc_profile=profile(ADOBE, 1.8, "other"))
+    assert np.abs(read_image(path) - expected).max() <= 0.6  # the matrices have five digits
+    with Image.open(path) as image:
+        colours = colours_of(image)
+    assert (colours is None) == (expected is COLOURS) and (colours is None or "cICP" in colours.name)
+
+
+@pytest.mark.parametrize(("codes", "words"), [
+    ((9, 16, 0, 1), "BT.2020 with PQ"), ((9, 18, 0, 1), "BT.2020 with HLG"), ((1, 13, 0, 0), "BT.709"),
+    ((99, 13, 0, 1), "primaries 99"), ((1, 77, 0, 1), "curve 77"), ((1, 13, 5, 1), "BT.709"),
+])  # fmt: skip
+def test_code_points_without_a_known_conversion_are_told(tmp_path, codes, words):
+    path = save(tmp_path / "a.png", pnginfo=chunks((b"cICP", bytes(codes))))
+    assert (read_image(path) == COLOURS).all()
+    with Image.open(path) as image:
+        colours = colours_of(image)
+    assert colours is not None and not colours.is_known and words in colours.name
+
+
+def test_code_points_that_say_nothing_leave_it_to_the_rest(tmp_path):
+    path = save(tmp_path / "a.png", pnginfo=chunks((b"cICP", bytes((2, 2, 0, 1)))), icc_profile=profile(P3, 2.2, "P3"))
+    assert np.abs(read_image(path) - srgb_of(COLOURS, P3, 2.2)).max() <= 2
+
+
+def test_a_png_says_its_primaries(tmp_path):
+    """With its gamma, or sRGB's curve; sRGB's own, as files round them, change nothing; one white becomes the other."""
+    own, p3 = (0.3127, 0.329, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06), (0.3127, 0.329, 0.68, 0.32, 0.265, 0.69, 0.15, 0.06)
+    gamma = (b"gAMA", (55556).to_bytes(4, "big"))
+    for pairs, expected in (
+        ((places(*own),), COLOURS), ((places(0.313, 0.329, *own[2:]),), COLOURS), ((places(*p3), (b"sRGB", b"\0")), COLOURS),
+        ((places(*p3),), srgb_of(of_curve(COLOURS), P3, 1.0)), ((places(*p3), gamma), srgb_of(COLOURS, P3, 1.8)),
+    ):  # fmt: skip
+        path = save(tmp_path / "a.png", pnginfo=chunks(*pairs))
+        assert np.abs(read_image(path) - expected).max() <= 0.6
+    greys = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    for white in ((0.3457, 0.3585), (1 / 3, 1 / 3), (0.314, 0.351)):
+        Image.fromarray(greys).save(tmp_path / "a.png", pnginfo=chunks(places(*white, *p3[2:])))
+        assert np.abs(read_image(tmp_path / "a.png").astype(int) - greys).max() <= 1
+
+
+@pytest.mark.parametrize("given", [
+    [0] * 8, [0.3127, 0.329, *[0.3, 0.3] * 3], [0.9, 0.05, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06],
+    [0.3127, 0.329, 0.64, 0.33, 40000.0, 0.6, 0.15, 0.06], [0.3127, 0.0, 0.64, 0.33, 0.3, 0.6, 0.15, 0.06],
+])  # fmt: skip
+def test_primaries_that_are_none_are_told(tmp_path, given):
+    path = save(tmp_path / "a.png", pnginfo=chunks(places(*given)))
+    assert (read_image(path) == COLOURS).all()
+    with Image.open(path) as image:
+        colours = colours_of(image)
+    assert colours is not None and not colours.is_known and "cHRM" in colours.name
+
+
 def test_sixteen_bits_of_linear_light(tmp_path):
     values = np.linspace(0, 65535, 24).astype(np.uint16).reshape(2, 12, 1)
     data = scenes.png_bytes(values)

@@ -10,8 +10,10 @@ from PIL import Image
 
 from nerfvol.cameras.further_lenses import Rational
 from nerfvol.cameras.lens import BrownConrady, Fisheye
-from nerfvol.datasets.load import load_dataset
+from nerfvol.config.octree import OctreeConfig
+from nerfvol.datasets.load import dataset_cameras, load_dataset
 from nerfvol.errors import InputError
+from nerfvol.training import surface_stages
 from tests.datasets.test_whatever_people_bring import said, scene
 from tests.fixtures import scenes
 
@@ -112,6 +114,47 @@ def test_one_picture_that_shows_nothing_is_left_out(tmp_path, channels):
     assert len(dataset) == 9 and len(dataset.images) == 9 and "view_003" not in dataset.names
     said(dataset, "1 of 10 images show nothing")
     assert len(load_dataset(tmp_path, "val")) == 2
+
+
+@pytest.mark.parametrize(("downscale", "size", "left"), [
+    (1, (4, 3), 7), (1, (41, 31), 7), (1, (43, 32), 8), (2, (40, 30), 7), (2, (43, 32), 8), (4, (60, 45), 7), (4, (88, 66), 8),
+])  # fmt: skip
+def test_a_thumbnail_among_photographs_is_left_out_and_the_others_can_be_reduced(tmp_path, downscale, size, left):
+    """800 pixels wide: 32 are a 25th, and half as large 16, as few as there may be."""
+    images = [np.broadcast_to((np.arange(800) + i).astype(np.uint8)[:, None], (600, 800, 3)) for i in range(10)]
+    images[9] = images[9][: size[1], : size[0]]
+    lens = {"w": 800, "h": 600, "fl_x": 700.0, "fl_y": 700.0}
+
+    def change(document):
+        document["frames"][9].update(w=size[0], h=size[1], fl_x=0.9 * size[0], fl_y=0.9 * size[0])
+
+    dataset = load_dataset(scene(tmp_path, 10, change=change, images=images, **lens), downscale=downscale)
+    assert len(dataset) == len(dataset.images) == left
+    cameras, bounds = dataset_cameras(tmp_path, downscale=downscale)
+    assert [camera.intrinsics for camera in cameras] == [camera.intrinsics for camera in dataset.cameras]
+    np.testing.assert_array_equal(bounds.aabb, dataset.scene.aabb)
+    if left == 7:
+        plain = scene(tmp_path / "plain", 9, images=images[:9], cameras=scenes.ring(10)[:9], **lens)
+        np.testing.assert_array_equal(load_dataset(plain, downscale=downscale).scene.aabb, bounds.aabb)
+        assert "view_009" in said(dataset, "1 of 8 images are thumbnails")
+    factor = surface_stages.image_factor(dataset.cameras, rays=1)
+    smallest = max(factor, *OctreeConfig().for_pictures(600 // downscale).downscales)
+    assert factor > 1
+    assert all(camera.scaled(smallest) for camera in dataset.cameras)
+
+
+def test_a_split_of_thumbnails_alone_stays(tmp_path):
+    """Every eighth view is held out: those are the small ones, and what they show is still compared."""
+    images = scenes.random_images(9, (240, 180))
+    images[0] = images[8] = images[0][:15, :20]
+
+    def change(document):
+        for i in (0, 8):
+            document["frames"][i].update(w=20, h=15, fl_x=20.0, fl_y=20.0)
+
+    scene(tmp_path, 9, change=change, images=images, w=240, h=180, fl_x=240.0, fl_y=240.0)
+    assert len(load_dataset(tmp_path)) == 7
+    assert [image.shape for image in load_dataset(tmp_path, "val").images] == [(15, 20, 3)] * 2
 
 
 def test_pictures_that_were_converted_are_found(tmp_path):

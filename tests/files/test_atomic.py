@@ -146,7 +146,7 @@ def test_what_is_written_to_a_pipe_goes_through_it(tmp_path):
     reader = threading.Thread(target=lambda: got.append(pipe.read_bytes()))
     reader.start()
     atomic.write_text(pipe, "through")
-    reader.join(10)
+    reader.join(300)
     assert got == [b"through"] and stat.S_ISFIFO(pipe.stat().st_mode)
 
 

@@ -190,7 +190,7 @@ def run(code: str, **environment) -> subprocess.CompletedProcess:
         env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
 
 

@@ -84,6 +84,7 @@ def test_gradcheck_of_the_images(degree):
 )
 def test_gradcheck_of_the_loss(terms):
     rng = np.random.default_rng(8)
+    torch.manual_seed(8)
     octree = random_octree("full", 0, rng)
     octree = octree.prune(np.arange(octree.n_leaves) % 5 == 0)[0]
     octree.density = rng.uniform(-1.0, 2.5, octree.n_vertices)

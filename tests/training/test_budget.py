@@ -167,7 +167,7 @@ def test_a_budget_is_kept(tmp_path, tiny_scene):
     started = time.perf_counter()
     start(config, started=started)
     log = log_of(tmp_path)
-    assert log[-1]["progress"] >= 1 and log[-1]["seconds"] > 1.5  # no upper bound: a busy machine may freeze it
+    assert log[-1]["progress"] >= 1 and log[-1]["seconds"] >= 1.5  # no upper bound: a busy machine may freeze it
 
 
 @pytest.mark.parametrize("budget, steps", [(1.0, {"octree": 0}), (20.0, {"splats": 0, "octree": 0})])

@@ -21,7 +21,7 @@ from nerfvol.region import SceneBounds
 from nerfvol.splats.points import dc_of_colour
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.leaves import PIXELS
-from nerfvol.training import convert, memory, octree_start, session, surface_stages
+from nerfvol.training import convert, memory, octree_start, session, surface_stages, train
 from nerfvol.training.appearance import Appearance
 from tests.fixtures.rooms import HALF, draw, facing_cameras, room_cameras, trace_planes, trace_room, write_photographs
 from tests.fixtures.runs import metrics_of, product, run_of, settings, start
@@ -241,6 +241,29 @@ def test_no_more_leaves_come_of_splats_than_are_announced():
     print(splats.n, octree.n_leaves / pixels, octree.n_leaves / splats.n, peak / octree.n_leaves)
     assert before < octree.n_leaves <= now == leaves
     assert peak <= memory.LOOK_BYTES * 3 * pixels + memory.SURFACE_BYTES * leaves
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_stages_of_ones_own_split_what_splats_became(tmp_path, scene, monkeypatch, own):
+    """Leaves of a first stage of level 6 alone are more than photographs of 1,728 pixels ask splats for."""
+
+    class Announced(Exception):
+        """What comes after is not asked."""
+
+    def announce(run, sentence):
+        raise Announced(sentence)
+
+    config = settings_of(scene, tmp_path)
+    if own:
+        config.octree.levels = [6, 6, 7, 7, 8, 8, 9]
+    monkeypatch.setattr(train, "announce", announce)
+    run = run_of(config)
+    plan = octree_start.prepare_splats(run)
+    with pytest.raises(Announced) as said:
+        train.begin_octree(run)
+    leaves = int(re.search(r"up to ([\d,]+) leaves", str(said.value))[1].replace(",", ""))
+    assert (plan.stage is None) == own
+    assert leaves == (8**6 if own else plan.leaves) and plan.leaves < 8**6
 
 
 def test_leaves_all_around_are_announced(tmp_path):

@@ -5,8 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -24,7 +22,7 @@ from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.octree.io import load_octree
 from nerfvol.training import session
-from tests.fixtures.runs import TINY, log_of, metrics_of, product, run_of, settings, start
+from tests.fixtures.runs import TINY, killed, log_of, metrics_of, product, run_of, settings, start
 
 ROOT = Path(nerfvol.__file__).parents[1]
 
@@ -259,13 +257,7 @@ def test_kill_9_costs_no_file(tmp_path, tiny_scene):
     (tmp_path / "tiny.yaml").write_text(json.dumps(plan))
     run = tmp_path / "run"
     arguments = ["train", "--out", str(run), "--config", str(tmp_path / "tiny.yaml")]
-    process = subprocess.Popen([sys.executable, "-m", "nerfvol.cli", *arguments], cwd=ROOT, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 60
-    while not (run / run_folder.LOG).exists() or len((run / run_folder.LOG).read_text().splitlines()) < 3:
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.002)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
+    killed(arguments, run, 3)
     assert load_checkpoint(run / run_folder.CHECKPOINT)["phase"] == "octree"
     start(assemble(Config, (plan, "plan"), ({"out": str(run), "resume": True}, "test")))
     start(assemble(Config, (plan, "plan"), ({"out": str(tmp_path / "straight")}, "test")))

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,7 @@ from nerfvol.training import finishing, session, splat_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
 from nerfvol.views import SplatModel
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
-from tests.fixtures.runs import TINY, log_of, metrics_of, settings, start
+from tests.fixtures.runs import TINY, killed, log_of, metrics_of, settings, start
 from tests.fixtures.tiny import write_scene
 
 ROOT = Path(nerfvol.__file__).parents[1]
@@ -141,13 +140,7 @@ def test_kill_9_costs_no_file(tmp_path, tiny_scene):
     (tmp_path / "tiny.yaml").write_text(json.dumps(plan))
     run = tmp_path / "run"
     arguments = ["train", "--out", str(run), "--config", str(tmp_path / "tiny.yaml")]
-    process = subprocess.Popen([sys.executable, "-m", "nerfvol.cli", *arguments], cwd=ROOT, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 60
-    while not (run / run_folder.LOG).exists() or len((run / run_folder.LOG).read_text().splitlines()) < 2:
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.002)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
+    killed(arguments, run, 2)
     at = load_checkpoint(run / run_folder.CHECKPOINT)["trainer"]["steps_done"]
     assert 0 < at < 600
     start(assemble(Config, (plan, "plan"), ({"out": str(run), "resume": True}, "test")))

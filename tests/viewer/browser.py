@@ -18,7 +18,7 @@ def launch():
     return playwright, playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
 
 
-def wait(page, condition: str, seconds: float = 60) -> None:
+def wait(page, condition: str, seconds: float = 300) -> None:
     """Until the JavaScript expression holds; the page's policy forbids playwright's own way."""
     end = time.monotonic() + seconds
     while not page.evaluate(f"Boolean({condition})"):

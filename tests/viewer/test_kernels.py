@@ -68,7 +68,7 @@ def run_node(folder: Path, tasks: list[dict]) -> None:
         [node, folder / "driver.js", folder / "engine.js", folder / "job.json"],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
 

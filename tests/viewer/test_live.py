@@ -37,26 +37,36 @@ def test_editions_come_out_and_change_nothing(tiny_scene, tmp_path, representati
     assert (tmp_path / "seen" / name).read_bytes() == (tmp_path / "unseen" / name).read_bytes()
 
 
-def test_pausing_is_no_training_time(tiny_scene, tmp_path):
-    """The pause is as long as the whole budget of the training, which ends by its clock all the same steps later."""
-    shown, pause, stood = Shown("paused"), 1.5, []
+def test_pausing_is_no_training_time(tiny_scene, tmp_path, monkeypatch):
+    """Whoever waits does so within what passes, and the clock leaves out all of it."""
+    shown, stood, waited = Shown("paused"), [], []
+    wait = shown.wait_while_paused
+
+    def wait_while_paused(stopped):
+        started = time.perf_counter()
+        threading.Timer(0.3, shown.pause, (False,)).start()
+        wait(stopped)
+        waited.append(time.perf_counter() - started)
+
+    monkeypatch.setattr(shown, "wait_while_paused", wait_while_paused)
 
     class Pausing(Live):
         def __call__(self, run, phase, began_stage):
             if phase.steps_done == 5:
                 shown.training = True
                 shown.pause(True)
-                before = run.clock.elapsed(), time.perf_counter()
-                threading.Timer(pause, shown.pause, (False,)).start()
+                started, before = time.perf_counter(), run.clock.elapsed()
                 super().__call__(run, phase, began_stage)
-                stood.append((run.clock.elapsed() - before[0], time.perf_counter() - before[1]))
+                counted = run.clock.elapsed() - before
+                stood.append((counted, time.perf_counter() - started))
             else:
                 super().__call__(run, phase, began_stage)
 
     live = Pausing(shown, every=1e9)
     train.train(runs.settings(tiny_scene, tmp_path / "run"), watch=live, say=lambda sentence: None)
     ((counted, passed),) = stood
-    assert passed >= pause and passed - counted >= pause - 0.05  # a step's edition counts, standing still does not
+    assert waited[0] >= 0.3 and passed - counted >= waited[0] - 1e-6  # an edition counts, standing still does not
+    monkeypatch.undo()
     shown.pause(True)
     shown.wait_while_paused(lambda: True)  # Ctrl-C ends a pause
 
