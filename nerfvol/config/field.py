@@ -123,7 +123,7 @@ class FieldConfig(Checked):
     levels say ..."""
     few_views: Annotated[int, at_least(0)] = 16
     """... and with so many training pictures or fewer that is what matters most: then it is ..."""
-    few_decay: Weight = 1e-4
+    few_decay: Weight = 3e-5
     """... this, colours do not depend on the direction, ..."""
     few_entropy: Weight = 0.01
     """... and the entropy of a ray's opacity has this weight."""
