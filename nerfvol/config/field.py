@@ -145,6 +145,11 @@ class FieldConfig(Checked):
         return next((stage for stage, end in enumerate(self.stage_ends) if progress < end), len(self.stage_ends) - 1)
 
 
+FEW_VIEWS_DISTILLED = {"level": 7}
+"""Settings of distilling a field of an object that few views show: an octree that begins with larger leaves and smaller
+pictures is smoother where nothing was seen (docs/experiments.md)."""
+
+
 @dataclass
 class DistillConfig(Checked):
     """How a field is made into an octree."""
@@ -159,7 +164,8 @@ class DistillConfig(Checked):
     }
 
     level: Level | None = None
-    """Finest leaves: 2**level along an edge of the inner cube. None: 8, and 6 in photographs, whose fields are hazy."""
+    """Finest leaves: 2**level along an edge of the inner cube. None: 8, 7 where few views show an object, and 6 in photographs,
+    whose fields are hazy."""
     coarse_level: Level = 5
     """Where the search begins; also the coarsest leaves that merging makes in the inner cube."""
     sh_degree: Degree | None = None

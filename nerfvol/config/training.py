@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from nerfvol.config.field import DistillConfig, FieldConfig
+from nerfvol.config.field import FEW_VIEWS_DISTILLED, DistillConfig, FieldConfig
 from nerfvol.config.medium import MediumConfig
 from nerfvol.config.octree import FEW_VIEWS, OctreeConfig
 from nerfvol.config.octree import SceneChoices as SceneChoices
@@ -153,10 +153,10 @@ class Config(Checked):
     def for_views(
         self, n: int, scene: SceneBounds, is_simulated: bool = False, begun: Collection[str] = (), side: int = 0
     ) -> Config:
-        """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
-        few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
-        smoothness in any case. Of one that many views show, and in photographs, splats are there sooner than fog has become
-        surfaces; photographs keep haze that fog leaves for good.
+        """The same with the octree's start, smoothness and backgrounds for ``n`` training views, where nobody chose them: of an
+        object that few views show a field leaves less open than low density does (docs/experiments.md), where there is time for
+        one; the others in any case. Of one that many views show, and in photographs, splats are there sooner than fog has
+        become surfaces; photographs keep haze that fog leaves for good.
 
         is_simulated: the data may show a medium, whose density counts: no splats, which are surfaces. begun: the phases that a
         resumed run has begun: another time budget, which it may have, must not choose another start. side: of the pictures,
@@ -175,7 +175,10 @@ class Config(Checked):
             suits = budget is not None if scene.is_unbounded else is_short
             start = "splats" if suits and not is_simulated else "auto"
         init = start if self.init == "auto" else self.init
-        return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS if few else {}))
+        if not few:
+            return dataclasses.replace(self, init=init)
+        octree, distill = filled(self.octree, FEW_VIEWS), filled(self.distill, FEW_VIEWS_DISTILLED)
+        return dataclasses.replace(self, init=init, octree=octree, distill=distill)
 
     def for_pictures(self, side: int) -> Config:
         """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""
