@@ -221,10 +221,10 @@ def test_arrays_that_do_not_fit_each_other_are_refused(change):
 @pytest.mark.parametrize("k", [1, 2])
 def test_the_same_tiles_before_a_second_background(k):
     """The same rays, and colours that differ by what shines through: (1 - alpha) (second - first)."""
-    dataset, second = views([(20, 33), (24, 16)], 0.5, seed=3), (0.0, 0.5, 0.25)
+    dataset, second = views([(20, 66), (24, 48)], 0.5, seed=3), (0.0, 0.5, 0.25)
     for i, image in enumerate(dataset.images):
-        image[:4] = 255  # opaque and white: foreground, though it cannot be seen before white
-        image[8:12, :, 3] = 90 + i
+        image[:16] = 255  # opaque and white: foreground, though it cannot be seen before white
+        image[18:22, :, 3] = 90 + i
     bank = TileBank(dataset, WHITE, k, second)
     everything = np.arange(bank.n_tiles), np.ones(bank.n_tiles, np.float32)
     one, two = bank.batch(*everything), bank.batch(*everything, second=True)
