@@ -215,7 +215,9 @@ def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:
     assert trainer.state.shape.sh_degree == 0 and trainer.state.shape.width == 64 > SMALL.shape.width
     assert trainer.few and not trainer_of(dataset).few
     fine = dataclasses.replace(SMALL, shape=dataclasses.replace(SMALL.shape, hash_min=12))
-    coarsest = {few: trainer_of(dataset, dataclasses.replace(fine, few_views=few)).state.shape.hash_min for few in (0, 8)}
+    coarsest = {
+        few: trainer_of(dataset, dataclasses.replace(fine, few_views=few)).state.shape.hash_min for few in (0, 8)
+    }
     assert coarsest == {0: 12, 8: 8} and trainer.state.shape.hash_min == SMALL.shape.hash_min == 4
     config, schedule = trainer.config, field_schedule
     assert (
