@@ -1,13 +1,13 @@
-"""Which start is best for an octree of an object, by measurement: a row a number of views and a budget, a column a start.
+"""Which start is best for an octree, by measurement: a row a number of views and a budget, a column a start.
 
     python tools/starts.py DATA OUT [--downscale 2] [--views 100,16,8,4] [--budgets 10s,30s,1m,2m] [--starts fog,field,splats]
         [--busy] [--background white]
 
-DATA is a folder with transforms_train.json and transforms_val.json. Of its N training views n are taken, every (N // n)-th.
+Of the N training views of DATA n are taken: with transforms_train.json every (N // n)-th, of photographs n evenly chosen ones.
 fog: ``train --init direct``; field: ``train --init mlp``; splats: trained for 0.4 of the budget, then ``convert --to octree``
-and trained for the rest; ``field-alone`` and ``splats-alone`` can be asked for too. Each command is one that a person could
-type; held-out views are scored afterwards, by ``nerfvol eval``, outside of the budget. What is in OUT/starts.json already is
-not run again.
+and trained for the rest; ``octree`` (the start that ``train`` chooses for one), ``auto`` (the representation that it chooses),
+``field-alone`` and ``splats-alone`` can be asked for too. Each command is one that a person could type; held-out views are
+scored afterwards, by ``nerfvol eval``, outside of the budget. What is in OUT/starts.json already is not run again.
 
 --busy: where other work shares the processor, every clock of the runs counts CPU seconds / 1.6, about what two threads of a
 quiet machine take (one with --threads 1); what is said of seconds then means those.
@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfvol.config.values import seconds as seconds_of
+from nerfvol.datasets.dataset import evenly
 
 BUSY = 1.6
 """CPU seconds that two threads take in a second of a quiet machine, loading included."""
@@ -47,7 +48,9 @@ def on_cpu_clock(argv: list[str]) -> None:
 
 
 def subset(data: Path, out: Path, n: int) -> Path:
-    """A folder of ``data`` with n of its training views, evenly chosen; made once."""
+    """A folder of ``data`` with n of its training views, evenly chosen, and all that are held out; made once."""
+    if not (data / "transforms_train.json").is_file():
+        return subset_of_photographs(data, out, n)
     listed: dict[str, Any] = json.loads((data / "transforms_train.json").read_text())
     if n > len(listed["frames"]):
         raise SystemExit(f"starts: --views: {data} has {len(listed['frames'])} training views, got {n}")
@@ -63,6 +66,23 @@ def subset(data: Path, out: Path, n: int) -> Path:
     return folder
 
 
+def subset_of_photographs(data: Path, out: Path, n: int) -> Path:
+    """The same of photographs, by lists of names beside them."""
+    from nerfvol.datasets.load import load_dataset
+
+    training, held_out = (load_dataset(data, split).names for split in ("train", "val"))
+    if not 1 < n <= len(training):
+        raise SystemExit(f"starts: --views: {data} has {len(training)} training views, got {n}")
+    folder = out / f"{data.name}_{n}"
+    folder.mkdir(parents=True, exist_ok=True)
+    for entry in data.iterdir():
+        if not (folder / entry.name).exists():
+            (folder / entry.name).symlink_to(entry.resolve())
+    for split, names in (("train", [training[i] for i in evenly(len(training), n)]), ("val", held_out)):
+        (folder / f"{split}.txt").write_text("\n".join(names))
+    return folder
+
+
 def commands(start: str, data: Path, out: Path, seconds: float, common: list[str]) -> tuple[list[list[str]], Path]:
     """nerfvol's commands for a cell, and the model that comes of them."""
 
@@ -72,6 +92,8 @@ def commands(start: str, data: Path, out: Path, seconds: float, common: list[str
 
     if start in ("fog", "field"):
         return [train("octree", seconds, "--init", "direct" if start == "fog" else "mlp")], out / "octree"
+    if start in ("auto", "octree"):
+        return [train(start, seconds)], out / start
     if start in ("field-alone", "splats-alone"):
         kind = start.split("-")[0]
         return [train(kind, seconds)], out / kind

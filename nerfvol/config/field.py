@@ -123,7 +123,7 @@ class FieldConfig(Checked):
     levels say ..."""
     few_views: Annotated[int, at_least(0)] = 16
     """... and with so many training pictures or fewer that is what matters most: then it is ..."""
-    few_decay: Weight = 1e-4
+    few_decay: Weight = 3e-5
     """... this, colours do not depend on the direction, ..."""
     few_entropy: Weight = 0.01
     """... and the entropy of a ray's opacity has this weight."""
@@ -145,6 +145,11 @@ class FieldConfig(Checked):
         return next((stage for stage, end in enumerate(self.stage_ends) if progress < end), len(self.stage_ends) - 1)
 
 
+FEW_VIEWS_DISTILLED = {"level": 7}
+"""Settings of distilling a field of an object that few views show: an octree that begins with larger leaves and smaller
+pictures is smoother where nothing was seen (docs/experiments.md)."""
+
+
 @dataclass
 class DistillConfig(Checked):
     """How a field is made into an octree."""
@@ -159,7 +164,8 @@ class DistillConfig(Checked):
     }
 
     level: Level | None = None
-    """Finest leaves: 2**level along an edge of the inner cube. None: 8, and 6 in photographs, whose fields are hazy."""
+    """Finest leaves: 2**level along an edge of the inner cube. None: 8, 7 where few views show an object, and 6 in photographs,
+    whose fields are hazy."""
     coarse_level: Level = 5
     """Where the search begins; also the coarsest leaves that merging makes in the inner cube."""
     sh_degree: Degree | None = None

@@ -92,6 +92,9 @@ class OctreeConfig(Checked):
     """... and of their colours' coefficients. None: 6e-5, and 4e-5 in photographs."""
     tv_from: Annotated[int, at_least(0)] | None = None
     """The step from which on both count. None: 1000, for at first objects have nothing that could overfit; 0 in photographs."""
+    two_backgrounds: bool | None = None
+    """Cut-out pictures are seen before their background and the colour farthest from it in turn, so that what has the
+    background's colour is not for nothing. None: where few views show an object (field.few_views)."""
     regulariser_decay: Decay = 0.1
     """The weights of all four terms shrink exponentially to this factor over the run."""
     rate_density: Rate = 0.3
@@ -180,14 +183,14 @@ def finest_level(side: int) -> int:
 
 
 BOUNDED = {"sh_degree": 1, "rate_decay": 0.04, "decay_from": 0.8, "coarse_error": 0.9, "growing_error": 0.0,
-           "sparsity": 0.0, "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000}  # fmt: skip
+           "sparsity": 0.0, "tv_density": 6e-5, "tv_sh": 6e-5, "tv_from": 1000, "two_backgrounds": False}  # fmt: skip
 PHOTOGRAPHS = {"sh_degree": 2, "rate_decay": 0.02, "decay_from": 0.35, "coarse_error": 0.5, "growing_error": 0.5,
-               "sparsity": 1.2e-3, "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0}  # fmt: skip
+               "sparsity": 1.2e-3, "tv_density": 2e-5, "tv_sh": 4e-5, "tv_from": 0, "two_backgrounds": False}  # fmt: skip
 """Settings of an octree where nothing else is said."""
 PHOTOGRAPHS_FROM_SURFACES = {"sparsity": 3e-4, "decay_from": 0.6}
 """... of photographs where it begins with surfaces, so that little haze is to be forbidden, and rates need not fall early
 (docs/experiments.md)."""
-FEW_VIEWS = {"tv_density": 3e-4, "tv_sh": 3e-4, "tv_from": 0}
+FEW_VIEWS = {"tv_density": 3e-4, "tv_sh": 3e-4, "tv_from": 0, "two_backgrounds": True}
 """... and of an object that few views show, which begins as a field (docs/experiments.md)."""
 
 
@@ -204,6 +207,7 @@ class SceneChoices:
     tv_density: float
     tv_sh: float
     tv_from: int
+    two_backgrounds: bool
 
     @classmethod
     def of(cls, config: OctreeConfig, scene: SceneBounds) -> SceneChoices:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from nerfvol.config.field import DistillConfig, FieldConfig
+from nerfvol.config.field import FEW_VIEWS_DISTILLED, DistillConfig, FieldConfig
 from nerfvol.config.medium import MediumConfig
 from nerfvol.config.octree import FEW_VIEWS, OctreeConfig
 from nerfvol.config.octree import SceneChoices as SceneChoices
@@ -155,10 +155,10 @@ class Config(Checked):
     def for_views(
         self, n: int, scene: SceneBounds, is_simulated: bool = False, begun: Collection[str] = (), side: int = 0
     ) -> Config:
-        """The same with the octree's start and smoothness for ``n`` training views, where nobody chose them: of an object that
-        few views show a field leaves less open than low density does (docs/experiments.md), where there is time for one;
-        smoothness in any case. Of one that many views show, and in photographs, splats are there sooner than fog has become
-        surfaces, and where there is more time a field; photographs keep haze that fog leaves for good.
+        """The same with the octree's start, smoothness and backgrounds for ``n`` training views, where nobody chose them: of an
+        object that few views show a field leaves less open than low density does (docs/experiments.md), where there is time for
+        one; the others in any case. Of one that many views show, and in photographs, splats are there sooner than fog has
+        become surfaces, and where there is more time a field; photographs keep haze that fog leaves for good.
 
         is_simulated: the data may show a medium, whose density counts: no splats, which are surfaces. begun: the phases that a
         resumed run has begun: another time budget, which it may have, must not choose another start. side: of the pictures,
@@ -176,7 +176,10 @@ class Config(Checked):
             is_too_short = budget is None or (budget <= SHORT_RUN and not scene.is_unbounded)
             start = "auto" if is_too_short or is_simulated else "splats" if budget <= until else "mlp"
         init = start if self.init == "auto" else self.init
-        return dataclasses.replace(self, init=init, octree=filled(self.octree, FEW_VIEWS if few else {}))
+        if not few:
+            return dataclasses.replace(self, init=init)
+        octree, distill = filled(self.octree, FEW_VIEWS), filled(self.distill, FEW_VIEWS_DISTILLED)
+        return dataclasses.replace(self, init=init, octree=octree, distill=distill)
 
     def for_pictures(self, side: int) -> Config:
         """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerfvol.cameras.camera import Intrinsics, tile_pixels, tile_rays
 from nerfvol.datasets.dataset import Dataset
+from nerfvol.datasets.images import composite_average
 from nerfvol.errors import InputError, shown
 from nerfvol.kernels.state import TILE_RAYS, Batch
 from nerfvol.native import native
@@ -49,11 +50,21 @@ class TileBank:
     A *background tile* is one whose pixels all have the background's colour; the others are *foreground tiles*. Background
     tiles teach little but are many: they are drawn less often and weigh more, so that the expected loss stays the mean over
     all pixels. Those of a picture share one tile of pixels: where much is background, the bank is a fraction of the pictures.
+
+    ``second``: another background; the same tiles can be drawn before it, and a background tile is plain before both.
     """
 
-    def __init__(self, dataset: Dataset, background: Sequence[float], k: int):
-        sorted_out = dataset.pyramid(background, k, lambda image: _sort_out(_tiled(image), background))
-        self.pixels = [pixels for pixels, _ in sorted_out]
+    def __init__(
+        self, dataset: Dataset, background: Sequence[float], k: int, second: Sequence[float] | None = None
+    ) -> None:
+        if second is None:
+            sorted_out = dataset.pyramid(background, k, lambda image: _sort_out([_tiled(image)], [background]))
+        else:
+            both = [background, second]
+            first, then = (dataset.pyramid(colour, k, _tiled) for colour in both)
+            sorted_out = [_sort_out(pair, both) for pair in zip(first, then, strict=True)]
+        self.pixels = [pixels[0] for pixels, _ in sorted_out]
+        self.second_pixels = [pixels[-1] for pixels, _ in sorted_out]
         self.row = np.concatenate([row for _, row in sorted_out])
         cameras = [c.scaled(k) for c in dataset.cameras]
         self.origins = np.stack([c.c2w[:3, 3] for c in cameras]).astype(np.float32)
@@ -103,8 +114,9 @@ class TileBank:
         """Rays of all tiles, padding included."""
         return self.n_tiles * TILE_RAYS
 
-    def draw(self, n: int, foreground_share: float, seed: int, cursors: Cursors) -> Batch:
-        """The next n tiles: a share of ``foreground_share`` from the foreground's queue, the rest from the background's."""
+    def draw(self, n: int, foreground_share: float, seed: int, cursors: Cursors, second: bool = False) -> Batch:
+        """The next n tiles: a share of ``foreground_share`` from the foreground's queue, the rest from the background's.
+        ``second``: before the second background."""
         n_foreground = n if not len(self.background_tiles) else min(n, round(n * foreground_share))
         if not len(self.foreground_tiles):
             n_foreground = 0
@@ -116,11 +128,11 @@ class TileBank:
             if count:
                 parts.append(_next(tiles, cursor, count, [seed, stream]))
                 weights.append(np.full(count, len(tiles) / self._n_counting * n / count, np.float32))
-        return self.batch(np.concatenate(parts), np.concatenate(weights))
+        return self.batch(np.concatenate(parts), np.concatenate(weights), second)
 
-    def batch(self, tiles: np.ndarray, tile_weights: np.ndarray) -> Batch:
+    def batch(self, tiles: np.ndarray, tile_weights: np.ndarray, second: bool = False) -> Batch:
         """Rays and colours of the ``tiles`` (n,) int, in rising order; padding weighs 0, every other ray its tile's weight
-        times its mask's.
+        times its mask's. ``second``: before the second background.
 
         tile_weights: (n,) float32. The batch's arrays are float32: rays_o (n, 3), rays_d and target (64 n, 3), weight (64 n,).
         """
@@ -130,12 +142,13 @@ class TileBank:
         directions = np.empty((len(tiles), TILE_RAYS, 3), np.float32)
         target = np.empty((len(tiles), TILE_RAYS, 3), np.float32)
         weight = np.repeat(tile_weights[:, None], TILE_RAYS, 1)
+        pixels = self.second_pixels if second else self.pixels
         if (compiled := native()) is not None:
-            compiled.gather_tiles(self._directions, self.pixels, self.rotations, image, tile, row, directions, target)
+            compiled.gather_tiles(self._directions, pixels, self.rotations, image, tile, row, directions, target)
         else:
             for i, (m, t, r) in enumerate(zip(image, tile, row, strict=True)):
                 np.matmul(self._directions[m][t], self.rotations[m].T, out=directions[i])
-                target[i] = self.pixels[m][r]
+                target[i] = pixels[m][r]
             target *= np.float32(1 / 255)
         if self._padded:
             for i, (m, t) in enumerate(zip(image, tile, strict=True)):
@@ -160,17 +173,23 @@ def _tiled(image: np.ndarray) -> np.ndarray:
     return padded.reshape(rows, 8, cols, 8, 3).transpose(0, 2, 1, 3, 4).reshape(-1, TILE_RAYS, 3)
 
 
-def _sort_out(tiles: np.ndarray, background: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (1 + foreground tiles, 64, 3), a background tile first; and which of these each of ``tiles`` (n, 64, 3) is."""
-    background_tile = np.tile(np.round(np.asarray(background) * 255).astype(np.uint8), (1, TILE_RAYS, 1))
-    foreground = (tiles != background_tile).any((1, 2))
-    pixels = np.concatenate([background_tile, tiles[foreground]])
+def _sort_out(
+    tiles: Sequence[np.ndarray], backgrounds: Sequence[Sequence[float]]
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Of an image's ``tiles`` (n, 64, 3) before each of the ``backgrounds``: pixels (1 + foreground tiles, 64, 3), a background
+    tile first; and which of these each tile is, (n,)."""
+    clear = np.zeros(
+        (1, 1, 4), np.uint8
+    )  # the colour that compositing gives: it may round 127.5 another way than np.round
+    plain = [np.tile(composite_average(clear, b, 1), (1, TILE_RAYS, 1)) for b in backgrounds]
+    foreground = np.any([(t != p).any((1, 2)) for t, p in zip(tiles, plain, strict=True)], axis=0)
+    pixels = [np.concatenate([p, t[foreground]]) for t, p in zip(tiles, plain, strict=True)]
     return pixels, np.where(foreground, np.cumsum(foreground), 0).astype(np.int32)
 
 
 def foreground_share(dataset: Dataset, background: Sequence[float], views: int = 4) -> float:
     """Share of foreground tiles in a few of the dataset's views: how large a TileBank will be."""
-    rows = dataset.evenly(views).pyramid(background, 1, lambda image: _sort_out(_tiled(image), background)[1])
+    rows = dataset.evenly(views).pyramid(background, 1, lambda image: _sort_out([_tiled(image)], [background])[1])
     return float(np.mean(np.concatenate(rows) > 0))
 
 

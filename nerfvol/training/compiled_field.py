@@ -25,6 +25,7 @@ from nerfvol.native import native
 from nerfvol.neural import FieldModel
 from nerfvol.training import field_schedule
 from nerfvol.training.appearance import Appearance, small_picture
+from nerfvol.training.backgrounds import is_second, second_background
 from nerfvol.training.field_looks import look
 from nerfvol.training.field_phase import FIELD_SHARE, SECONDS_TO_DISTILL, FieldReport
 
@@ -37,6 +38,8 @@ MOST_RAYS = 32768
 FEW_WIDTH = 64
 """Neurons of a layer, at least, where there are few training views: a wide network guesses better what none of them sees, with
 many views it only costs time."""
+FEW_COARSEST = 8
+"""Cells along an edge of the coarsest grid, at most, there: what no view tells then follows from what is wide around it."""
 SECONDS_TO_WRITE = 0.3
 """Of a field that is the product."""
 
@@ -113,15 +116,17 @@ class CompiledFieldTrainer:
         self.few = len(dataset) <= config.few_views
         shape = config.shape
         if self.few:
-            shape = dataclasses.replace(shape, sh_degree=0, width=max(shape.width, FEW_WIDTH))
+            coarsest = min(shape.hash_min, FEW_COARSEST)
+            shape = dataclasses.replace(shape, sh_degree=0, width=max(shape.width, FEW_WIDTH), hash_min=coarsest)
         self.config = dataclasses.replace(config, shape=shape)
         self.background = (float(background[0]), float(background[1]), float(background[2]))
         self.state = FieldState(domain, shape, seed)
+        self.second = second_background(dataset, self.background, self.few)
         self.occupancy = Occupancy(domain, config.grid_resolution)
         self.steps_done, self.stage = 0, 0  # an image scale is no stage: nothing else changes with it
         self.march = March(self.occupancy, config.march_steps[-1], near_plane)
         self.n_rays = max(1, config.samples_per_step // 64)
-        self._pixels: dict[int, Pixels] = {}
+        self._pixels: dict[tuple[int, bool], Pixels] = {}  # by image scale, and whether before the second background
 
     # ------------------------------------------------------------------ what a run asks of a phase
     @property
@@ -195,11 +200,13 @@ class CompiledFieldTrainer:
         config = self.config
         progress = min(1.0, self.steps_done / config.steps if progress is None else progress)
         stage = config.stage_at(progress)
-        batch = self._bank(config.downscales[stage]).sample(self.n_rays, self.seed, self.steps_done)
+        second = is_second(self.second, self.steps_done)
+        batch = self._bank(config.downscales[stage], second).sample(self.n_rays, self.seed, self.steps_done)
+        behind = self.second if self.second and second else self.background
         step, n_levels = self.steps_done, self.state.n_levels
         self.march = self.march.with_steps(field_schedule.march_steps(config, stage, step))
         self.state.use_levels(field_schedule.levels_in_use(n_levels, step))
-        loss = field_schedule.loss_at(config, self.few, self.background, progress)
+        loss = field_schedule.loss_at(config, self.few, behind, progress)
         rates = field_schedule.rates_at(config, self.few, step, progress)
         moves = field_schedule.moves(n_levels, step)
         report = field_ops.train_step(self.state, batch, self.march, loss, rates, moves)
@@ -217,10 +224,11 @@ class CompiledFieldTrainer:
         wanted = self.config.samples_per_step / max(per_ray, 0.25)
         self.n_rays = max(1, min(MOST_RAYS, int(min(wanted, 1.25 * self.n_rays + 16))))
 
-    def _bank(self, downscale: int) -> Pixels:
-        if downscale not in self._pixels:
-            self._pixels = {downscale: Pixels(self.dataset, self.background, downscale)}
-        return self._pixels[downscale]
+    def _bank(self, downscale: int, second: bool) -> Pixels:
+        if (downscale, second) not in self._pixels:
+            colours = {False: self.background} | ({} if self.second is None else {True: self.second})
+            self._pixels = {(downscale, s): Pixels(self.dataset, c, downscale) for s, c in colours.items()}
+        return self._pixels[downscale, second]
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that lives between steps, as arrays and numbers."""

@@ -25,6 +25,7 @@ from nerfvol.kernels.state import TILE_RAYS
 from nerfvol.machine import available_memory
 from nerfvol.octree.rows import BLOCKS
 from nerfvol.octree.tree import Octree
+from nerfvol.training.backgrounds import second_background
 from nerfvol.training.splat_schedule import Schedule
 
 BASE_BYTES = 160 << 20
@@ -43,10 +44,9 @@ VERTICES_PER_LEAF = 1.65
 """Vertices of an octree that was split where it pays, for each leaf: measured on lego, 1.5 to 1.7 at every size."""
 BEFORE_SHARE = 0.4
 """Of the leaves of the largest octree: those that the octree before it had, which is in memory while its leaves are split."""
-FOREGROUND_BYTES_PER_PIXEL = 3
-"""Per training pixel in a foreground tile: 8-bit RGB."""
 TILE_BYTES_PER_PIXEL = 0.33
-"""Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool)."""
+"""Per training pixel: a 64th of a tile's image, number, row, place in two queues (int32 each) and colour (bool); next to
+8-bit RGB of the foreground, before each background."""
 LEAVES_PER_PIXEL = 2.2
 """Leaves of an octree split where it pays, for each pixel of one view: 1.38 million for lego at 800x800. Thick media have
 several times as many."""
@@ -76,14 +76,16 @@ SHARE = 0.9
 class OtherMemory:
     """What a run holds besides the octree and its training images.
 
-    foreground_share: of the training tiles, those of the foreground. held_out_bytes: of images. field: whether the
-    octree comes from a field. splats: bytes of all that is there while splats are trained that it comes from; 0: it does not.
+    foreground_share: of the training tiles, those of the foreground. backgrounds: that these are held before. held_out_bytes:
+    of images. field: whether the octree comes from a field. splats: bytes of all that is there while splats are trained that
+    it comes from; 0: it does not.
     """
 
     foreground_share: float = 1.0
     held_out_bytes: int = 0
     field: bool = False
     splats: int = 0
+    backgrounds: int = 1
 
 
 @dataclass(frozen=True)
@@ -151,14 +153,15 @@ def estimate_training(
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
     octree, change = octree_bytes(leaves, sh_degree, vertices), change_bytes(leaves, sh_degree, vertices)
     growth = 0 if not dataset.can_reload or vertices is not None else change + octree // 2
-    tiles = int((TILE_BYTES_PER_PIXEL + FOREGROUND_BYTES_PER_PIXEL * other.foreground_share) * pixels)
+    colours = 3 * other.backgrounds * pixels
+    tiles = int(TILE_BYTES_PER_PIXEL * pixels + other.foreground_share * colours)
     return MemoryEstimate(
         base=BASE_BYTES + (FIELD_BYTES if other.field else 0),
         images=tiles + other.held_out_bytes + max(0, dataset.nbytes - growth),
         octree=octree,
         change=change,
         leaves=leaves,
-        distillation=dataset.nbytes + 3 * pixels + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
+        distillation=dataset.nbytes + colours + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
         splats=other.splats,
     )
 
@@ -306,7 +309,8 @@ def field_memory(dataset: Dataset, config: FieldConfig, held_out_bytes: int) -> 
     """The estimate of training a field that is the product, in words."""
     shape = config.shape
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
-    images = dataset.nbytes + 3 * pixels // min(config.downscales) ** 2 + held_out_bytes
+    backgrounds = 1 + (second_background(dataset, WHITE, len(dataset) <= config.few_views) is not None)
+    images = dataset.nbytes + 3 * backgrounds * pixels // min(config.downscales) ** 2 + held_out_bytes
     entries = shape.hash_levels * shape.hash_features << shape.hash_log2_table if shape.encoding == "hash" else 0
     network = sum(layer.numbers for layer in layers_of(shape))
     field = 4 * 4 * (entries + network) + 4 * config.grid_resolution**3 * (1 + dataset.scene.n_shells)
@@ -346,7 +350,10 @@ class OctreePlan:
         share = foreground_share(dataset, config.background or WHITE)
         pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
         self.foreground_tiles = max(share, 0.01) * pixels / TILE_RAYS
-        self._other = OtherMemory(share, held_out_bytes, field=config.init == "mlp", splats=splats)
+        backgrounds = 1 + (second_background(dataset, WHITE, bool(config.octree.two_backgrounds)) is not None)
+        self._other = OtherMemory(
+            share, held_out_bytes, field=config.init == "mlp", splats=splats, backgrounds=backgrounds
+        )
         self._degree = max(config.octree.sh_degree or 0, config.octree.final_sh_degree)
         wanted = largest_octree(config.octree.levels, lens.width * lens.height, dataset.scene.is_unbounded)
         wanted = leaves if leaves and not grows else max(wanted, leaves)

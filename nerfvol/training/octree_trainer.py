@@ -29,6 +29,7 @@ from nerfvol.octree.tree import Octree
 from nerfvol.starts.fog import low_density_octree
 from nerfvol.starts.visible import ENOUGH_VIEWS, solid
 from nerfvol.training.appearance import Appearance, small_picture
+from nerfvol.training.backgrounds import is_second, second_background
 from nerfvol.training.growing_octree import GrowingOctree
 from nerfvol.training.memory import OctreePlan
 from nerfvol.training.octree_end import FINAL_PRUNE_WEIGHTS, FINAL_TILES, outcome, pruned_at_the_end, seconds_to_write
@@ -78,6 +79,7 @@ class OctreeTrainer(GrowingOctree):
     ):
         config, self.chosen = config.for_scene(dataset.scene), SceneChoices.of(config, dataset.scene)
         self.dataset, self.background, self.config, self.seed = dataset, tuple(background), config, seed
+        self.second = second_background(dataset, background, self.chosen.two_backgrounds)
         self.appearance = appearance or Appearance(len(dataset), "off")
         start = low_density_octree(dataset, config.levels[0], self.chosen.sh_degree) if octree is None else octree
         super().__init__(start, plan.max_leaves if plan else None)
@@ -206,9 +208,10 @@ class OctreeTrainer(GrowingOctree):
         if self.bank is None:
             self.bank = self._make_bank()
         smooth = self.steps_done >= self.chosen.tv_from
-        options = losses_at(progress, c, self.chosen, self._random_background(), smooth)
+        options = losses_at(progress, c, self.chosen, self._behind(), smooth)
         rates = rates_at(progress, c, self.chosen)
-        batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors)
+        second = is_second(self.second, self.steps_done)
+        batch = self.bank.draw(c.tiles[self.stage], c.foreground_share, self.seed, self.cursors, second)
         started = time.perf_counter()
         report = ops.train_step(self.octree, self.state, batch, options, rates, self.bank.pixel_angle)
         self.seconds_a_tile = (time.perf_counter() - started) / c.tiles[self.stage]
@@ -217,21 +220,21 @@ class OctreeTrainer(GrowingOctree):
         self.tiles_seen += c.tiles[self.stage]
         return report
 
-    def _random_background(self) -> tuple[float, ...]:
-        """What this step's rays see where they leave the octree: the background of objects.
+    def _behind(self) -> tuple[float, ...]:
+        """What this step's rays see where they leave the octree: the background of objects, or the second one.
 
         In photographs another colour each step, for they have none, and nothing in them may rely on one.
         """
-        if not self.dataset.scene.is_unbounded:
-            return self.background
-        return random_background(self.seed, self.steps_done)
+        if self.dataset.scene.is_unbounded:
+            return random_background(self.seed, self.steps_done)
+        return self.second if self.second and is_second(self.second, self.steps_done) else self.background
 
     def _make_bank(self) -> TileBank:
         dataset, seen = self.dataset, self.appearance
         if seen.active:
             images = Corrected(dataset.images, seen.corrected_colours)
             dataset = dataclasses.replace(dataset, images=images)
-        return TileBank(dataset, self.background, self.config.downscales[self.stage])
+        return TileBank(dataset, self.background, self.config.downscales[self.stage], self.second)
 
     def fit_appearance(self, progress: float) -> bool:
         """Fits the photographs' colour maps to what the octree shows of small pictures of them; whether they are used."""

@@ -216,3 +216,29 @@ def test_tiles_outside_their_picture_are_refused(image, tile, row):
 def test_arrays_that_do_not_fit_each_other_are_refused(change):
     with pytest.raises(ValueError):
         gathered(**change)
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_the_same_tiles_before_a_second_background(k):
+    """The same rays, and colours that differ by what shines through: (1 - alpha) (second - first)."""
+    dataset, second = views([(20, 66), (24, 48)], 0.5, seed=3), (0.0, 0.5, 0.25)
+    for i, image in enumerate(dataset.images):
+        image[:16] = 255  # opaque and white: foreground, though it cannot be seen before white
+        image[18:22, :, 3] = 90 + i
+    bank = TileBank(dataset, WHITE, k, second)
+    everything = np.arange(bank.n_tiles), np.ones(bank.n_tiles, np.float32)
+    one, two = bank.batch(*everything), bank.batch(*everything, second=True)
+    for name in ("rays_o", "rays_d", "weight"):
+        assert np.array_equal(getattr(one, name), getattr(two, name))
+    clear = dataclasses.replace(dataset, images=[
+        np.dstack([np.full((*i.shape[:2], 3), 255, np.uint8), 255 - i[..., 3:]]) for i in dataset.images
+    ])  # fmt: skip
+    through = whole_batch(TileBank(clear, (0.0, 0.0, 0.0), k)).target
+    # Three roundings to 8 bits, half a level each
+    np.testing.assert_allclose(
+        two.target - one.target, through * (np.array(second) - WHITE), atol=1.5 / 255 + 1e-6, rtol=0
+    )
+    assert np.array_equal(bank.is_background, (through == 1).reshape(bank.n_tiles, -1).all(1))
+    cursors, others = Cursors(), Cursors()
+    a, b = bank.draw(5, 0.6, 1, cursors), bank.draw(5, 0.6, 1, others, second=True)
+    assert np.array_equal(a.rays_d, b.rays_d) and not np.array_equal(a.target, b.target) and cursors == others

@@ -214,6 +214,11 @@ def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:
     trainer = trainer_of(dataset, dataclasses.replace(SMALL, few_views=8))
     assert trainer.state.shape.sh_degree == 0 and trainer.state.shape.width == 64 > SMALL.shape.width
     assert trainer.few and not trainer_of(dataset).few
+    fine = dataclasses.replace(SMALL, shape=dataclasses.replace(SMALL.shape, hash_min=12))
+    coarsest = {
+        few: trainer_of(dataset, dataclasses.replace(fine, few_views=few)).state.shape.hash_min for few in (0, 8)
+    }
+    assert coarsest == {0: 12, 8: 8} and trainer.state.shape.hash_min == SMALL.shape.hash_min == 4
     config, schedule = trainer.config, field_schedule
     assert (
         schedule.rates_at(config, True, 0, 0.0).table_decay

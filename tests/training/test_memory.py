@@ -98,11 +98,13 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
         affordable_leaves(dataset, 1, available=150 << 20)
 
 
-def test_images_count(dataset):
+@pytest.mark.parametrize("second", [None, (0.0, 0.0, 0.0)])
+def test_images_count(dataset, second):
     """Tiles by what a bank really holds; the files' pixels as long as they cannot be released for a larger octree."""
-    bank = TileBank(dataset, (1.0, 1.0, 1.0), 1)
+    bank = TileBank(dataset, (1.0, 1.0, 1.0), 1, second)
     held = [
         *bank.pixels,
+        *(bank.second_pixels if second else ()),
         bank.row,
         bank.image,
         bank.tile,
@@ -110,7 +112,8 @@ def test_images_count(dataset):
         bank.foreground_tiles,
         bank.background_tiles,
     ]
-    share = OtherMemory(foreground_share=len(bank.foreground_tiles) / len(bank.row), held_out_bytes=77)
+    foreground = len(bank.foreground_tiles) / len(bank.row)
+    share = OtherMemory(foreground, held_out_bytes=77, backgrounds=1 if second is None else 2)
     tiles = sum(array.nbytes for array in held)
     small, large = (estimate_training(dataset, leaves, 1, share).images for leaves in (0, 10**6))
     assert large - 77 == pytest.approx(tiles, rel=0.1)

@@ -289,6 +289,8 @@ def test_objects_of_few_views_begin_as_fields_where_there_is_time(views, alpha, 
     config = Config(**given).for_views(views, scene).for_scene(scene)
     assert config.init == start
     assert tv is None or config.octree.tv_sh == config.octree.tv_density == tv
+    if config.init == "mlp":
+        assert config.distill.level == 7 and config.octree.two_backgrounds
     assert "octree" not in given or (config.octree.tv_sh, config.octree.tv_density) == (0.5, 3e-4)
 
 

@@ -1,0 +1,30 @@
+"""What few cut-out pictures are seen before while a model is trained: their background and the colour farthest from it.
+
+Before one colour whatever has that colour costs nothing, in front of the object or beside it, and few views do not show that it
+is there. Before two in turn opacity is the silhouette's: what is half transparent is wrong before one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nerfvol.datasets.dataset import Dataset
+from nerfvol.starts.hull import has_silhouettes
+
+Colour = tuple[float, float, float]
+
+
+def farthest(background: Sequence[float]) -> Colour:
+    """The colour of the RGB cube that is farthest from ``background`` (3,) in [0, 1]."""
+    r, g, b = (0.0 if c >= 0.5 else 1.0 for c in background)
+    return r, g, b
+
+
+def second_background(dataset: Dataset, background: Sequence[float], wanted: bool) -> Colour | None:
+    """The second of the two colours; None: there is one alone, for a second is not wanted or the pictures are not cut out."""
+    return farthest(background) if wanted and has_silhouettes(dataset) else None
+
+
+def is_second(second: Colour | None, step: int) -> bool:
+    """Whether step ``step`` has the second colour behind."""
+    return second is not None and step % 2 == 1
