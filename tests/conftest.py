@@ -3,12 +3,18 @@
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from nerfvol.octree.tree import Octree
 from tests.fixtures.tiny import make_sphere_octree, write_scene
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# The same examples in every run, however long they take: what is to be found by chance is looked for by tools/fuzz.py.
+hypothesis.settings.register_profile(
+    "same", derandomize=True, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("same")
 
 
 @pytest.fixture(scope="session")

@@ -72,7 +72,7 @@ function crop(box) {
     given.value = (box || around)[end][k];
   }));
   const words = box?.flat().map((x) => Number(x.toPrecision(4))).join(",");
-  $("box").textContent = box ? `nerfvol export FILE --crop ${words}` : "Nothing is cropped";
+  $("box").textContent = box ? `nerfvol export FILE --crop=${words}` : "Nothing is cropped";
   clearTimeout(cropped);
   cropped = setTimeout(() => {
     drawing?.crop(box);

@@ -13,7 +13,10 @@ from nerfvol.errors import InputError
 from tests.fixtures import scenes
 
 SETTINGS = settings(
-    max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 ODD = st.one_of(
     st.none(), st.booleans(), st.text(max_size=3), st.just([]), st.just({}), st.just([[1]]),

@@ -15,7 +15,9 @@ from nerfvol.errors import InputError
 from nerfvol.files.arrayfile import ArrayFile, write_arrays
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 
-SETTINGS = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 
 
 def same(a, b):

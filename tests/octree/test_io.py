@@ -22,7 +22,9 @@ from nerfvol.octree.topology import morton
 from nerfvol.octree.tree import Octree
 
 BYTE = st.integers(0, 255)
-SETTINGS = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 
 
 def make_octree(seed=0, degree=1, level=3, share=0.2):

@@ -12,7 +12,9 @@ from nerfvol.splats.ply import is_splat_ply, load_ply, save_ply
 from nerfvol.splats.points import OPAQUE, PointCloud, read_points, spacing, splats_of_points
 from nerfvol.splats.splats import Splats
 
-SETTINGS = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 COLUMNS = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 

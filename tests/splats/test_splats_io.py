@@ -14,7 +14,9 @@ from nerfvol.errors import InputError
 from nerfvol.splats.io import describe_splats, load_splats, save_splats
 from nerfvol.splats.splats import Splats
 
-SETTINGS = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
 ARRAYS = ("means", "log_scales", "quats", "logits", "sh")
 
 
