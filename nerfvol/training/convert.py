@@ -35,7 +35,7 @@ from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds, cube
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.field import distill
-from nerfvol.starts.leaves import PIXELS, octree_around
+from nerfvol.starts.leaves import octree_around
 from nerfvol.starts.subject import subject_of
 from nerfvol.starts.surfaces import Seen, write_surfaces
 from nerfvol.starts.surfels import surfels
@@ -45,7 +45,7 @@ from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.phase import FinalPhase
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, make_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
-from nerfvol.training.surface_stages import image_factor, levels_finer, rays_of, with_stage
+from nerfvol.training.surface_stages import MOST_LEVEL, finest_level, rays_of, stage_of, with_stage
 from nerfvol.views import SplatModel
 
 MOST_DISCS = 100_000
@@ -64,7 +64,6 @@ FITTED_PIXELS = 400
 """Longer side, at most, of these pictures; of larger cameras a whole fraction."""
 VIRTUAL_VIEWS, VIRTUAL_ANGLE = 64, 0.7
 """Cameras all around a model whose own are not known, and their angle of view, radians."""
-MOST_LEVEL = 10
 FINE_STEPS = 1500
 """Steps on photographs where no time is given."""
 LOOK_AGAIN = 0.08
@@ -188,10 +187,8 @@ def surfaces_to_train(
     if level is None and scene.is_unbounded:
         left = None if config.time_budget is None else max(config.time_budget - process_seconds(), 1.0)
         settings = dataclasses.replace(config.octree, steps=FINE_STEPS)
-        rays = rays_of(settings, left)
-        factor = image_factor(cameras, rays)
+        level, factor = stage_of(scene, cameras, rays_of(settings, left))
         cameras = [camera.scaled(factor) for camera in cameras]
-        level = finest_level(scene, cameras) + levels_finer(cameras, rays)
         config = dataclasses.replace(config, octree=with_stage(config.octree, level, factor))
     return surfaces_of(splats, scene, cameras, background, level), config
 
@@ -326,13 +323,3 @@ def cost(a: Model, b: Model, views: Dataset, background: Sequence[float]) -> tup
     """PSNR of both models on ``views``, dB."""
     first, second = (evaluate(model, views, background)["psnr"] for model in (a, b))
     return cast(float, first), cast(float, second)
-
-
-def finest_level(scene: SceneBounds, cameras: Sequence[Camera]) -> int:
-    """Level whose leaves are about PIXELS wide at the scene's middle for the nearest camera, at most MOST_LEVEL."""
-    pixel = min(
-        float(np.linalg.norm(c.position - scene.center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras
-    )
-    # A camera may stand in the middle: in a room, or where all photographs are taken from one place.
-    pixel = max(pixel, 4.0**-MOST_LEVEL * scene.side)
-    return int(np.clip(round(math.log2(scene.side / (PIXELS * pixel))), 5, MOST_LEVEL))

@@ -37,12 +37,12 @@ from nerfvol.training.phase import Phase
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import Schedule
 from nerfvol.training.surface_stages import (
-    MOST_FACTOR,
+    MOST_LEVEL,
+    finest_level,
     has_stages_of_its_own,
-    image_factor,
-    levels_finer,
     rays_of,
     stage_in,
+    stage_of,
     with_stage,
 )
 from nerfvol.views import OctreeModel
@@ -143,7 +143,6 @@ def _how_fine(run: Run, splats: int) -> tuple[tuple[int, int] | None, int]:
     """The stage of an octree that at most so many ``splats`` of photographs become, level of its finest leaves and factor of
     the photographs' reduction, None: as its settings say; and about how many leaves it begins with. As fine as there are rays
     and memory for."""
-    from nerfvol.training.convert import finest_level
     from nerfvol.training.splat_start import start_share
 
     scene, cameras, left = run.data.training.scene, run.data.training.cameras, run.seconds_left()
@@ -154,12 +153,13 @@ def _how_fine(run: Run, splats: int) -> tuple[tuple[int, int] | None, int]:
     if not scene.is_unbounded or has_stages_of_its_own(run.given.octree):
         return None, surface_leaves(splats, pixels, scene.is_unbounded)
     rays = rays_of(run.config.octree, None if left is None else (1 - start_share(scene)) * left)
-    factor, most = image_factor(cameras, rays), photographs_bytes() or math.inf
-    while SURFACE_BYTES * surface_leaves(splats, pixels // factor**2) > most and factor < MOST_FACTOR:
-        factor *= 2
-    cameras = [camera.scaled(factor) for camera in cameras]
-    level = finest_level(scene, cameras) + levels_finer(cameras, rays)
-    return (level, factor), surface_leaves(splats, pixels // factor**2)
+    most = photographs_bytes() or math.inf
+
+    def leaves(factor: int) -> int:
+        return surface_leaves(splats, pixels // factor**2)
+
+    stage = stage_of(scene, cameras, rays, lambda factor: SURFACE_BYTES * leaves(factor) <= most)
+    return stage, leaves(stage[1])
 
 
 def start_from_splats(
@@ -175,7 +175,7 @@ def start_from_splats(
     Raises:
         InputError: splats were asked for, and none lies in the scene's region, or none is seen.
     """
-    from nerfvol.training.convert import MOST_LEVEL, finest_level, surfaces_of
+    from nerfvol.training.convert import surfaces_of
     from nerfvol.training.splat_start import StartingSplats, settings_of, start_share, start_splats
 
     config, background, data = run.config, run.background, run.data

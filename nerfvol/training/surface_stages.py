@@ -8,13 +8,18 @@ pixels: of photographs of 12 million pixels a minute sees an eighth of the size,
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig
 from nerfvol.errors import InputError
 from nerfvol.kernels.state import TILE_RAYS
+from nerfvol.region import SceneBounds
+from nerfvol.starts.leaves import PIXELS
 
 RAYS_PER_SECOND = 400_000.0
 """What a second of a time budget is worth: rays of an octree of surfaces on two cores, some 10 segments each."""
@@ -26,8 +31,35 @@ times: 24.83 to 25.13 dB; bonsai, 1.2 times: 24.30 to 24.10, for fewer steps wer
 SMALLEST = 100
 """Pixels along the longer side, at least, of the reduced photographs."""
 MOST_FACTOR = 256
+MOST_LEVEL = 10
+"""Of the leaves that are asked for where nobody says how fine; one more where rays suffice (levels_finer)."""
 STAGE = {"stage_ends": [1.0], "tiles": [320], "prunes": [2]}
 """All of the run: there is no haze that small pictures would have to clear first."""
+
+
+def finest_level(scene: SceneBounds, cameras: Sequence[Camera]) -> int:
+    """Level whose leaves are about PIXELS wide at the scene's middle for the nearest camera, at most MOST_LEVEL."""
+    pixel = min(
+        float(np.linalg.norm(c.position - scene.center)) / max(c.intrinsics.fx, c.intrinsics.fy) for c in cameras
+    )
+    # A camera may stand in the middle: in a room, or where all photographs are taken from one place.
+    pixel = max(pixel, 4.0**-MOST_LEVEL * scene.side)
+    return int(np.clip(round(math.log2(scene.side / (PIXELS * pixel))), 5, MOST_LEVEL))
+
+
+def stage_of(
+    scene: SceneBounds, cameras: Sequence[Camera], rays: float, fits: Callable[[int], bool] = lambda factor: True
+) -> tuple[int, int]:
+    """Level of the finest leaves and factor of the photographs' reduction that ``rays`` rays are worth.
+
+    cameras: of the whole photographs. fits: whether there is memory for leaves of photographs reduced by a factor; they are
+    reduced until there is, or by MOST_FACTOR.
+    """
+    factor = image_factor(cameras, rays)
+    while factor < MOST_FACTOR and not fits(factor):
+        factor *= 2
+    reduced = [camera.scaled(factor) for camera in cameras]
+    return finest_level(scene, reduced) + levels_finer(reduced, rays), factor
 
 
 def image_factor(cameras: Sequence[Camera], rays: float) -> int:
