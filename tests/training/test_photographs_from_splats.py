@@ -98,6 +98,18 @@ def test_photographs_are_as_large_as_each_pixel_can_be_drawn(rays, factor):
     assert surface_stages.image_factor([Camera(lens, np.eye(4))] * 100, rays) == factor
 
 
+def test_photographs_are_reduced_until_their_leaves_fit():
+    """... and the level follows the size that is left; MOST_FACTOR is the end where nothing fits."""
+    cameras = [Camera(Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0), np.eye(4))] * 10
+    box = np.array([[-1.0] * 3, [1.0] * 3]) + [0.0, 0.0, -5.0]
+    bounds, rays = SceneBounds(box, np.array([box.mean(0) - 4, box.mean(0) + 4]), False), 2.0 * 10 * 640 * 480
+    for least in (1, 4, 16):
+        level = convert.finest_level(bounds, [camera.scaled(least) for camera in cameras]) + (least > 1)
+        stage = surface_stages.stage_of(bounds, cameras, rays, lambda factor, least=least: factor >= least)
+        assert stage == (level, least)
+    assert surface_stages.stage_of(bounds, cameras, rays, lambda factor: False)[1] == surface_stages.MOST_FACTOR
+
+
 def test_what_a_time_or_steps_are_worth():
     config = OctreeConfig(steps=30)
     assert surface_stages.rays_of(config, None) == 30 * 320 * 64
