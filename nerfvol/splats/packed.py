@@ -113,4 +113,4 @@ def _harmonics(file: PlyFile) -> NDArray[np.float32]:
     _expect(file, "sh", names, "u1")
     table = file.read("sh")
     codes = np.stack([table[name] for name in names], axis=1).reshape(file.count, 3, number // 3)
-    return ((codes.astype(np.float32) + np.float32(0.5)) / 256 - np.float32(0.5)) * np.float32(2 * LARGEST_HARMONIC)
+    return (((codes + 0.5) / 256 - 0.5) * (2 * LARGEST_HARMONIC)).astype(np.float32)

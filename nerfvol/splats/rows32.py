@@ -41,7 +41,7 @@ def load_splat(path: str | os.PathLike[str]) -> Splats:
     rows = np.frombuffer(data, _ROW)
     if (negative := (rows["scales"] < 0).any(axis=1)).any():
         raise fault(f"a scale of vertex {int(negative.argmax())} is negative")
-    quats = (rows["quats"].astype(np.float32) - 128) / 128
+    quats = ((rows["quats"].astype(np.float32) - 128) / 128).astype(np.float32)
     quats[(rows["quats"] == 128).all(axis=1)] = (1, 0, 0, 0)  # programs write it for a ball, which no rotation turns
     rgba = rows["rgba"] / 255.0
     with np.errstate(divide="ignore", invalid="ignore"):
