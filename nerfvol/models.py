@@ -67,14 +67,19 @@ FORMATS = {
 """The ``format`` key of a file's document, and what opens it."""
 SUFFIXES = {
     ".ply": "nerfvol.clouds:load_ply_model", ".spz": "nerfvol.views:SplatModel.load",
-    ".npz": "nerfvol.views:OctreeModel.load_plenoctree",
+    ".splat": "nerfvol.views:SplatModel.load", ".npz": "nerfvol.views:OctreeModel.load_plenoctree",
 }  # fmt: skip
 """Files of other programs, by the end of their names, and what opens them."""
+NOT_READ = {
+    ".ksplat": "Gaussians as GaussianSplats3D keeps them", ".sog": "Gaussians as PlayCanvas keeps them in pictures",
+    ".lcc": "Gaussians as XGRIDS keeps them", ".splatv": "Gaussians that move",
+}  # fmt: skip
+"""Files that splat-transform and SuperSplat, or their own program, can write as a .ply; what they hold."""
 
 
 def load_model(target: str | os.PathLike[str]) -> Model:
     """The model in a run folder or a file: our own octrees, splats, fields and media, the first two also in a page (.html),
-    Gaussians or points in a .ply, Gaussians in a .spz, a PlenOctree in an .npz.
+    Gaussians or points in a .ply, Gaussians in a .spz or .splat, a PlenOctree in an .npz.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.
@@ -94,6 +99,11 @@ def load_model(target: str | os.PathLike[str]) -> Model:
 def describe_file(target: str | os.PathLike[str]) -> dict[str, Any]:
     """The JSON document in a model's file; of other programs' files the format alone."""
     named = model_path(target)
+    if held := NOT_READ.get(named.suffix.lower()):
+        raise InputError(
+            f"{named} holds {held}, which nerfvol does not read: export it as .ply, as SuperSplat or "
+            f"'splat-transform {named.name} {named.stem}.ply' do"
+        )
     if named.suffix.lower() in SUFFIXES:
         return {"format": named.suffix.lower()}
     with model_file(named) as path:

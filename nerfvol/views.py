@@ -26,6 +26,7 @@ from nerfvol.octree.tree import Octree
 from nerfvol.splats.io import load_splats, save_splats
 from nerfvol.splats.packing import PackedSplats, as_packed, unpack
 from nerfvol.splats.ply import load_ply
+from nerfvol.splats.rows32 import load_splat
 from nerfvol.splats.splats import Splats
 from nerfvol.splats.spz import load_spz
 
@@ -248,8 +249,8 @@ class SplatModel:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SplatModel:
-        """The model in a file of splats, our own or, by its suffix, .ply or .spz; InputError where it is none."""
-        reader = {".ply": load_ply, ".spz": load_spz}.get(Path(path).suffix.lower())
+        """The model in a file of splats, our own or, by its suffix, .ply, .spz or .splat; InputError where it is none."""
+        reader = {".ply": load_ply, ".spz": load_spz, ".splat": load_splat}.get(Path(path).suffix.lower())
         splats, metadata = load_splats(path) if reader is None else (reader(path), {})
         if reader is not None and not splats.n:
             raise InputError(f"{path} holds no Gaussians, so there is nothing to draw")

@@ -17,18 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.errors import InputError
+from nerfvol.splats.foreign import LARGEST, checked
 from nerfvol.splats.near import relative
+from nerfvol.splats.packed import is_packed, unpacked
 from nerfvol.splats.plyfile import PlyFile, write_ply
 from nerfvol.splats.splats import Splats
 
 Mode = Literal["mip", "plain"]
 MAX_DEGREE = 3
-LARGEST = 1e15
-"""Of positions, as for cameras; coefficients and logarithms are held to much less."""
-LARGEST_COEFFICIENT = 1e6
-LARGEST_LOG_SCALE = 40.0
-LARGEST_LOGIT = 80.0
-_SHORTEST = 1e-12  # of a quaternion that still is a direction
 _ORIGIN = "nerfvol origin"
 _WRITTEN = {"mip": "mip", "plain": "default"}
 
@@ -72,20 +68,22 @@ def is_splat_ply(path: str | os.PathLike[str]) -> bool:
         InputError: it is no PLY file.
     """
     with PlyFile(path) as file:
-        return "scale_0" in file.dtypes
+        return "scale_0" in file.dtypes or is_packed(file)
 
 
 def load_ply(path: str | os.PathLike[str], mode: Mode = "plain") -> Splats:
     """The Gaussians of a PLY file; ``mode`` is what they are taken for where the file does not say.
 
-    Binary of either byte order and ascii; columns in any order; others are ignored. The origin is that
-    of a comment (see save_ply), else 0.
+    Binary of either byte order and ascii; columns in any order; others are ignored; or packed as SuperSplat does
+    (splats/packed.py). The origin is that of a comment (see save_ply), else 0.
 
     Raises:
         InputError: one sentence that names the file and what is wrong with it.
     """
     with PlyFile(path) as file:
         stated = _mode(file)
+        if is_packed(file):
+            return checked(file.fault, **unpacked(file), origin=_origin(file), mode=stated or mode)
         degree = _check_columns(file)
         table = file.read()
 
@@ -97,13 +95,11 @@ def load_ply(path: str | os.PathLike[str], mode: Mode = "plain") -> Splats:
         sh = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, :, None]
         if names:
             sh = np.concatenate([sh, columns(*names).reshape(len(sh), 3, len(names) // 3)], axis=2)
-        splats = Splats(
-            means=columns("x", "y", "z"), log_scales=_log_scales(file, columns("scale_0", "scale_1", "scale_2")),
-            quats=columns(*(f"rot_{k}" for k in range(4))), logits=_logits(file, columns("opacity")[:, 0]), sh=sh,
+        return checked(
+            file.fault, means=columns("x", "y", "z"), log_scales=columns("scale_0", "scale_1", "scale_2"),
+            quats=columns(*(f"rot_{k}" for k in range(4))), logits=columns("opacity")[:, 0], sh=sh,
             origin=_origin(file), mode=stated or mode,
         )  # fmt: skip
-        _check_values(file, splats)
-        return splats
 
 
 def _mode(file: PlyFile) -> Mode | None:
@@ -159,34 +155,3 @@ def _check_columns(file: PlyFile) -> int:
         if f"f_rest_{k}" not in file.dtypes:
             raise file.fault(f"its vertices have no property 'f_rest_{k}'")
     return degree
-
-
-def _log_scales(file: PlyFile, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Trainers write -inf for a scale of nothing (discs of 2D splatting): that is the smallest there is."""
-    if np.isnan(values).any() or (values > LARGEST_LOG_SCALE).any():
-        bad = int((~(values <= LARGEST_LOG_SCALE)).any(axis=1).argmax())
-        raise file.fault(f"a scale of vertex {bad} is not a logarithm of at most {LARGEST_LOG_SCALE:g}")
-    return np.maximum(values, np.float32(-LARGEST_LOG_SCALE)) if (values < -LARGEST_LOG_SCALE).any() else values
-
-
-def _logits(file: PlyFile, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Opacities of exactly 0 and 1 have infinite logits; ±80 is the same in float32."""
-    if np.isnan(values).any():
-        raise file.fault(f"the opacity of vertex {int(np.isnan(values).argmax())} is not a number")
-    limit = np.float32(LARGEST_LOGIT)
-    return np.clip(values, -limit, limit) if (np.abs(values) > limit).any() else values
-
-
-def _check_values(file: PlyFile, splats: Splats) -> None:
-    bounds = (
-        ("position", splats.means, LARGEST),
-        ("rotation", splats.quats, LARGEST_COEFFICIENT),
-        ("colour", splats.sh.reshape(splats.n, 3 * splats.sh.shape[2]), LARGEST_COEFFICIENT),
-    )
-    for what, values, bound in bounds:
-        good = (np.abs(values) < bound).all(axis=1)  # fails for what is no number as well
-        if not good.all():
-            raise file.fault(f"the {what} of vertex {int((~good).argmax())} is not finite or beyond {bound:g}")
-    length = np.linalg.norm(splats.quats.astype(np.float64), axis=1)
-    if splats.n and length.min() < _SHORTEST:
-        raise file.fault(f"the rotation of vertex {int(length.argmin())} is a quaternion of length 0")

@@ -1,14 +1,15 @@
-"""PLY files: one header of text, then rows. Only the element "vertex" is read; nothing is believed before it is checked.
+"""PLY files: one header of text, then the rows of its elements; nothing is believed before it is checked.
 
-The header ends within 64 kB; the number of vertices is held against the file's size before memory is taken for them.
+The header ends within 64 kB; the number of rows is held against the file's size before memory is taken for them.
 Format: G. Turk, "The PLY polygon file format", 1994. Rows are read as they lie where all their properties are numbers;
-lists in the vertices themselves are refused, other elements only if they come before the vertices.
+lists in the vertices themselves are refused, in other elements only if these come before what is read.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,23 @@ _TYPES = {
 _RUN = 1 << 24  # bytes that are read at a time
 
 
+@dataclass
+class Element:
+    """Rows of one kind: how many, and the numpy dtype of each property by its name, in the file's order.
+
+    fault: what of its properties cannot be read, such as a list; "": nothing.
+    """
+
+    count: int
+    dtypes: dict[str, np.dtype] = field(default_factory=dict)
+    fault: str = ""
+
+
 class PlyFile:
     """An open PLY file whose header is known; rows are read when :meth:`read` asks for them.
 
-    ``count``: vertices; ``dtypes``: numpy dtype by property name, in the file's order; ``comments``: without the word
-    itself; ``format``: binary_little_endian, binary_big_endian or ascii.
+    ``elements``: by name, in the file's order; ``count``, ``dtypes``: of the vertices; ``comments``: without the word itself;
+    ``format``: binary_little_endian, binary_big_endian or ascii.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -84,77 +97,101 @@ class PlyFile:
 
     def _parse(self, lines: list[list[str]]) -> None:
         self.comments = [" ".join(words[1:]) for words in lines if words[0] in ("comment", "obj_info")]
-        self.dtypes: dict[str, np.dtype] = {}
-        self.count, self.format, element, before = -1, "", "", False
+        self.elements: dict[str, Element] = {}
+        self.format, element = "", None
         for words in lines:
             if words[0] in ("comment", "obj_info"):
                 continue
             if words[0] == "format" and len(words) == 3 and words[1] in _FORMATS:
                 self.format = words[1]
             elif words[0] == "element" and len(words) == 3:
-                element = words[1]
-                if element == "vertex" and self.count < 0:
-                    self.count = self._number(words[2])
-                elif self.count < 0 and self._number(words[2]):
-                    before = True
+                if words[1] in self.elements:
+                    raise self.fault(f"its header declares the element {words[1][:40]!r} twice")
+                element = self.elements[words[1]] = Element(self._number(words[2]))
             elif words[0] == "property" and len(words) >= 3:
-                if element == "vertex":
-                    self._property(words)
+                if element is not None:
+                    self._property(element, words)
             else:
                 raise self.fault(f"its header has a line that is not understood: {' '.join(words)[:60]!r}")
         if not self.format:
             raise self.fault("its header states no format that is known (binary or ascii, version 1.0)")
-        if self.count < 0 or not self.dtypes:
+        vertices = self.elements.get("vertex")
+        if vertices is None or not vertices.dtypes:
             raise self.fault("its header declares no vertices")
-        if before:
-            raise self.fault("another element comes before its vertices")
-        self._check_size()
+        self.count, self.dtypes = vertices.count, vertices.dtypes
+        self._place("vertex")
 
     def _number(self, word: str) -> int:
         if not (word.isascii() and word.isdigit()) or len(word) > 18:
             raise self.fault(f"a count should be a whole number, it is {word[:40]!r}")
         return int(word)
 
-    def _property(self, words: Sequence[str]) -> None:
+    def _property(self, element: Element, words: Sequence[str]) -> None:
         if not self.format:
             raise self.fault("its header lists properties before it states the format")
+        fault, is_vertex = "", element is self.elements.get("vertex")
         if words[1] == "list":
-            raise self.fault(f"its vertices have a list ({' '.join(words)[:60]!r}), expected numbers only")
-        if len(words) != 3 or words[1] not in _TYPES:
-            raise self.fault(f"a property should be a type and a name, it is {' '.join(words[1:])[:60]!r}")
-        if words[2] in self.dtypes or len(self.dtypes) == MOST_PROPERTIES:
-            raise self.fault(f"its vertices have the property {words[2][:40]!r} twice, or more than {MOST_PROPERTIES}")
-        self.dtypes[words[2]] = np.dtype(_FORMATS[self.format] + _TYPES[words[1]])
+            fault = f"its vertices have a list ({' '.join(words)[:60]!r}), expected numbers only"
+        elif len(words) != 3 or words[1] not in _TYPES:
+            fault = f"a property should be a type and a name, it is {' '.join(words[1:])[:60]!r}"
+        elif words[2] in element.dtypes or len(element.dtypes) == MOST_PROPERTIES:
+            what = "vertices have" if is_vertex else "rows have"
+            fault = f"its {what} the property {words[2][:40]!r} twice, or more than {MOST_PROPERTIES}"
+        if fault and is_vertex:
+            raise self.fault(fault)
+        if fault:
+            element.fault = fault
+        else:
+            element.dtypes[words[2]] = np.dtype(_FORMATS[self.format] + _TYPES[words[1]])
 
-    def _check_size(self) -> None:
-        """Refuses a count of vertices that the file cannot hold."""
-        row = sum(t.itemsize for t in self.dtypes.values())
-        if self.format == "ascii":
-            row = 2 * len(self.dtypes)  # a digit and a space or the line's end
-        have = self._size - self._rows_at + (self.format == "ascii")
-        if self.count * row > have:
-            raise self.fault(
-                f"it declares {self.count} vertices, which need {self.count * row} bytes, and holds {have}"
-            )
+    def _place(self, name: str) -> int:
+        """Where the rows of an element begin: the byte or, in ascii, the line after the header; refuses counts that the file
+        cannot hold."""
+        have, need, at = self._size - self._rows_at + (self.format == "ascii"), 0, 0
+        for other, element in self.elements.items():
+            if element.fault and element.count:
+                before = "its vertices" if name == "vertex" else f"its element {name!r}"
+                raise self.fault(f"the element {other[:40]!r}, whose rows differ in length, comes before {before}")
+            at = need if self.format != "ascii" else at
+            row = sum(t.itemsize for t in element.dtypes.values())
+            if self.format == "ascii":
+                row = max(1, 2 * len(element.dtypes))  # a digit and a space or the line's end
+            need += element.count * row
+            if need > have:
+                rows = "vertices" if other == "vertex" else f"rows of {other[:40]!r}"
+                raise self.fault(
+                    f"it declares {element.count} {rows}, which need {element.count * row} bytes, and holds {have}"
+                )
+            if other == name:
+                break
+            if self.format == "ascii":
+                at += element.count
+        return at
 
-    def read(self) -> dict[str, NDArray]:
-        """The vertices' properties by name, each an array (count,) of native byte order.
+    def read(self, name: str = "vertex") -> dict[str, NDArray]:
+        """The properties of an element's rows by name, each an array (count,) of native byte order.
 
         Raises:
             InputError: the file cannot be read, is shorter than its header says, or holds other things than its numbers.
         """
         try:
-            self._file.seek(self._rows_at)
-            return self._read_text() if self.format == "ascii" else self._read_binary()
+            at = self._place(name)
+            if self.format == "ascii":
+                self._file.seek(self._rows_at)
+                for _ in range(at):
+                    self._file.readline(_RUN)
+                return self._read_text(name)
+            self._file.seek(self._rows_at + at)
+            return self._read_binary(self.elements[name])
         except OSError as error:
             raise InputError(f"cannot read {self.path}: {explain_os_error(error)}") from error
 
-    def _read_binary(self) -> dict[str, NDArray]:
-        row = np.dtype(list(self.dtypes.items()))
-        out = {name: np.empty(self.count, dtype.newbyteorder("=")) for name, dtype in self.dtypes.items()}
-        run = max(1, _RUN // row.itemsize)
-        for at in range(0, self.count, run):
-            n = min(run, self.count - at)
+    def _read_binary(self, element: Element) -> dict[str, NDArray]:
+        row = np.dtype(list(element.dtypes.items()))
+        out = {name: np.empty(element.count, dtype.newbyteorder("=")) for name, dtype in element.dtypes.items()}
+        run = max(1, _RUN // max(1, row.itemsize))
+        for at in range(0, element.count, run):
+            n = min(run, element.count - at)
             data = self._file.read(n * row.itemsize)
             if len(data) != n * row.itemsize:
                 raise self.fault("it became shorter while it was read")
@@ -163,25 +200,26 @@ class PlyFile:
                 column[at : at + n] = rows[name]
         return out
 
-    def _read_text(self) -> dict[str, NDArray]:
+    def _read_text(self, name: str) -> dict[str, NDArray]:
         """Numbers as text, by columns of float64: enough for every type that PLY has."""
-        values = np.empty((self.count, len(self.dtypes)))
-        for i in range(self.count):
+        element = self.elements[name]
+        values = np.empty((element.count, len(element.dtypes)))
+        for i in range(element.count):
             words = self._file.readline(_RUN).split()
             try:
                 values[i] = [float(word) for word in words]
             except ValueError:
                 line = b" ".join(words)[:60].decode("latin-1")
-                raise self.fault(f"vertex {i} should be {len(self.dtypes)} numbers, it is {line!r}") from None
+                raise self.fault(f"{name[:40]} {i} should be {len(element.dtypes)} numbers, it is {line!r}") from None
         out = {}
-        for k, (name, dtype) in enumerate(self.dtypes.items()):
+        for k, (column_name, dtype) in enumerate(element.dtypes.items()):
             column = values[:, k]
             if dtype.kind in "iu":
                 limits = np.iinfo(dtype)
                 if not ((column >= limits.min) & (column <= limits.max)).all():
-                    raise self.fault(f"a value of {name!r} is outside its type, {limits.min} to {limits.max}")
+                    raise self.fault(f"a value of {column_name!r} is outside its type, {limits.min} to {limits.max}")
             with np.errstate(over="ignore"):  # a number too large for float32 is infinite, which its reader refuses
-                out[name] = column.astype(dtype)
+                out[column_name] = column.astype(dtype)
         return out
 
 

@@ -37,7 +37,6 @@ from nerfvol.training.phase import Phase
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import Schedule
 from nerfvol.training.surface_stages import (
-    MOST_FACTOR,
     MOST_LEVEL,
     finest_level,
     has_stages_of_its_own,
@@ -154,14 +153,11 @@ def _how_fine(run: Run, splats: int) -> tuple[tuple[int, int] | None, int]:
     def leaves(factor: int) -> int:
         return surface_leaves(splats, pixels // factor**2, scene.is_unbounded)
 
+    if has_stages_of_its_own(run.given.octree):
+        return None, leaves(1)
     seconds = None if left is None else (1 - start_share(scene)) * left
-    stage = None if has_stages_of_its_own(run.given.octree) else stage_for(scene, cameras, run.config.octree, seconds)
-    if stage is None or not scene.is_unbounded:
-        return stage, leaves(1)
-    factor = stage[1]
-    while SURFACE_BYTES * leaves(factor) > most and factor < MOST_FACTOR:
-        factor *= 2
-    return stage_for(scene, cameras, run.config.octree, seconds, factor), leaves(factor)
+    stage = stage_for(scene, cameras, run.config.octree, seconds, lambda factor: SURFACE_BYTES * leaves(factor) <= most)
+    return stage, leaves(stage[1] if stage else 1)
 
 
 def start_from_splats(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from nerfvol.region import SceneBounds
 from nerfvol.starts.leaves import PIXELS
 
 MOST_LEVEL = 10
+"""Of the leaves that are asked for where nobody says how fine; one more where rays suffice (levels_finer)."""
 RAYS_PER_SECOND, RAYS_PER_SECOND_OF_OBJECTS = 400_000.0, 1_200_000.0
 """What a second of a time budget is worth: rays of an octree of surfaces on two cores, some 10 segments each in photographs."""
 EPOCHS = 1.0
@@ -48,15 +49,23 @@ def finest_level(scene: SceneBounds, cameras: Sequence[Camera]) -> int:
 
 
 def stage_for(
-    scene: SceneBounds, cameras: Sequence[Camera], config: OctreeConfig, seconds: float | None, least: int = 1
-) -> tuple[int, int] | None:
+    scene: SceneBounds, cameras: Sequence[Camera], config: OctreeConfig, seconds: float | None,
+    fits: Callable[[int], bool] = lambda factor: True,
+) -> tuple[int, int] | None:  # fmt: skip
     """The one stage of an octree of surfaces that is trained for ``seconds`` (None: the steps of ``config``): level of its
-    finest leaves and factor, ``least`` or more, of the pictures' reduction. None: the stages of the settings, for an object
-    that there is time to look at more often."""
+    finest leaves and factor of the photographs' reduction. None: the stages of the settings, for an object that there is time
+    to look at more often.
+
+    cameras: of the whole photographs. fits: whether there is memory for leaves of photographs reduced by a factor; they are
+    reduced until there is, or to a pixel.
+    """
     rays = rays_of(config, seconds, scene.is_unbounded)
     if not scene.is_unbounded:
         return None if levels_finer(cameras, rays) else (finest_level(scene, cameras), 1)
-    factor = max(least, image_factor(cameras, rays))
+    factor = image_factor(cameras, rays)
+    shortest = min(min(camera.intrinsics.width, camera.intrinsics.height) for camera in cameras)
+    while not fits(factor) and factor < MOST_FACTOR and shortest >= 2 * factor:
+        factor *= 2
     cameras = [camera.scaled(factor) for camera in cameras]
     return finest_level(scene, cameras) + levels_finer(cameras, rays), factor
 

@@ -98,6 +98,21 @@ def test_photographs_are_as_large_as_each_pixel_can_be_drawn(rays, factor):
     assert surface_stages.image_factor([Camera(lens, np.eye(4))] * 100, rays) == factor
 
 
+def test_photographs_are_reduced_until_their_leaves_fit():
+    """... and the level follows the size that is left; MOST_FACTOR is the end where nothing fits."""
+    cameras = [Camera(Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0), np.eye(4))] * 10
+    box = np.array([[-1.0] * 3, [1.0] * 3]) + [0.0, 0.0, -5.0]
+    bounds = SceneBounds(box, np.array([box.mean(0) - 4, box.mean(0) + 4]), False)
+    config, seconds = OctreeConfig(), 2.0 * 10 * 640 * 480 / surface_stages.RAYS_PER_SECOND
+    for least in (1, 4, 16):
+        level = surface_stages.finest_level(bounds, [camera.scaled(least) for camera in cameras]) + (least > 1)
+        stage = surface_stages.stage_for(bounds, cameras, config, seconds, lambda factor, least=least: factor >= least)
+        assert stage == (level, least)
+    for shrunk, most in ((1, surface_stages.MOST_FACTOR), (4, 64)):  # 480 and 120 pixels are halved while one is left
+        small = [camera.scaled(shrunk) for camera in cameras]
+        assert (surface_stages.stage_for(bounds, small, config, seconds, lambda factor: False) or (0, 0))[1] == most
+
+
 def test_what_a_time_or_steps_are_worth():
     config = OctreeConfig(steps=30)
     assert surface_stages.rays_of(config, None) == 30 * 320 * 64
