@@ -38,7 +38,8 @@ were not compared: there fog takes a small share of the time, and what splats le
 LONG_RUN = 45.0
 """Seconds of a time budget from which on a field that is the product has larger tables, ..."""
 LARGE_TABLES: dict[str, Any] = {"hash_log2_table": 19, "hash_max": 512}
-"""... these: they take 7 % longer a sample and hold details that a longer run has the time to learn (docs/performance.md)."""
+"""... these: a step takes 1.4 times as long, and they hold details that a longer run has the time to learn (lego 400x400:
+28.83 and 28.65 dB after 30 s, 29.49 and 29.63 after 60; docs/experiments.md)."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
