@@ -196,7 +196,7 @@ class FieldModel:
             resolution = numbers["grid_resolution"]
             entries = 0
             if shape.encoding == "hash":
-                grid = GridLevels.of(shape.hash_levels, shape.hash_log2_table, shape.hash_min, shape.hash_max)
+                grid = GridLevels.of(shape.hash_levels, shape.log2_table, shape.hash_min, shape.finest)
                 entries = grid.starts[-1]
             file.expect("table", "float32", (entries, shape.hash_features))
             file.expect("network", "float32", (sum(layer.numbers for layer in layers_of(shape)),))

@@ -26,6 +26,9 @@ from nerfvol.errors import InputError
 if TYPE_CHECKING:
     from nerfvol.region import SceneBounds
 
+LOG2_TABLE, FINEST = 17, 256
+"""Of a hash grid whose tables nobody chose: what an octree begins with has to learn and to be distilled in seconds."""
+
 
 @dataclass(frozen=True)
 class FieldShape(Checked):
@@ -43,12 +46,13 @@ class FieldShape(Checked):
     """Grids of the hash encoding."""
     hash_features: Count = 2
     """Numbers an entry of the hash encoding's tables holds."""
-    hash_log2_table: Annotated[int, within(4, 24)] = 17
-    """Entries of a table of the hash encoding, as a power of two."""
+    hash_log2_table: Annotated[int, within(4, 24)] | None = None
+    """Entries of a table of the hash encoding, as a power of two. None: 17, and with ``hash_max`` 19 where a field of an object
+    is the product, many views show it and there is time for it (``Config.for_field``)."""
     hash_min: Count = 16
     """Cells along an edge of the coarsest grid."""
-    hash_max: Count = 256
-    """Cells along an edge of the finest grid."""
+    hash_max: Count | None = None
+    """Cells along an edge of the finest grid. None: 256, and with ``hash_log2_table`` 512."""
     width: Count = 32
     """Neurons of a hidden layer; at least 64 where few views train by the compiled kernels."""
     depth: Count = 1
@@ -64,12 +68,26 @@ class FieldShape(Checked):
     density_bias: float = -1.0
     """Added to the raw density; negative: the field starts as thin haze."""
 
+    @property
+    def log2_table(self) -> int:
+        """``hash_log2_table``, or what it is where nobody chose it."""
+        return LOG2_TABLE if self.hash_log2_table is None else self.hash_log2_table
+
+    @property
+    def finest(self) -> int:
+        """``hash_max``, or what it is where nobody chose it."""
+        return FINEST if self.hash_max is None else self.hash_max
+
+    def settled(self) -> FieldShape:
+        """The same with a number for each None."""
+        return dataclasses.replace(self, hash_log2_table=self.log2_table, hash_max=self.finest)
+
     def check(self) -> None:
         if self.skip >= self.depth:
             raise InputError(f"field.shape.skip must be below field.shape.depth ({self.depth}), got {self.skip}")
-        if self.hash_max < self.hash_min:
+        if self.finest < self.hash_min:
             raise InputError(
-                f"field.shape.hash_max must be at least field.shape.hash_min ({self.hash_min}), got {self.hash_max}"
+                f"field.shape.hash_max must be at least field.shape.hash_min ({self.hash_min}), got {self.finest}"
             )
 
 

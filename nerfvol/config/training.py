@@ -11,9 +11,9 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from nerfvol.config.field import FEW_VIEWS_DISTILLED, DistillConfig, FieldConfig
+from nerfvol.config.field import FEW_VIEWS_DISTILLED, DistillConfig, FieldConfig, FieldShape
 from nerfvol.config.medium import MediumConfig
 from nerfvol.config.octree import FEW_VIEWS, OctreeConfig
 from nerfvol.config.octree import SceneChoices as SceneChoices
@@ -36,6 +36,11 @@ SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
 pixel of the pictures' shorter side, whichever is later; longer runs begin with a field. Fog takes most of the time to become
 surfaces (lego 400x400, 1 minute: 33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3,
 5 minutes: 35.0, 35.2, 34.7; docs/performance.md)."""
+LONG_RUN = 45.0
+"""Seconds of a time budget from which on a field that is the product has larger tables, ..."""
+LARGE_TABLES: dict[str, Any] = {"hash_log2_table": 19, "hash_max": 512}
+"""... these: a step takes 1.4 times as long, and they hold details that a longer run has the time to learn (lego 400x400:
+28.83 and 28.65 dB after 30 s, 29.49 and 29.63 after 60; docs/experiments.md)."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
 SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
@@ -180,6 +185,25 @@ class Config(Checked):
             return dataclasses.replace(self, init=init)
         octree, distill = filled(self.octree, FEW_VIEWS), filled(self.distill, FEW_VIEWS_DISTILLED)
         return dataclasses.replace(self, init=init, octree=octree, distill=distill)
+
+    def for_field(self, n: int, scene: SceneBounds, begun: FieldShape | None = None) -> Config:
+        """The same with the tables of a field that is the product, where nobody chose them: larger ones of an object that more
+        than ``field.few_views`` views show, where there is time to fill them. Photographs and few views were not compared.
+
+        n: training views. begun: the shape of the field that a resumed run has begun, which another time budget must not
+        change.
+        """
+        if self._suited(scene) != "field":
+            return self
+        shape, budget = self.field.shape, self.time_budget
+        tables: dict[str, Any] = {}
+        if begun is not None:
+            tables = {name: getattr(begun, name) for name in LARGE_TABLES}
+        elif all(getattr(shape, name) is None for name in LARGE_TABLES):
+            is_long = budget is not None and budget >= LONG_RUN
+            tables = LARGE_TABLES if is_long and n > self.field.few_views and not scene.is_unbounded else {}
+        settled = filled(shape, tables).settled()
+        return dataclasses.replace(self, field=dataclasses.replace(self.field, shape=settled))
 
     def for_pictures(self, side: int) -> Config:
         """The same with stages for pictures of ``side`` pixels along their shorter side, where nobody chose them."""

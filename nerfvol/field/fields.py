@@ -201,7 +201,7 @@ class HashField(NeuralField):
     """Multiresolution hash grid and a small trunk (Mueller et al. 2022)."""
 
     def __init__(self, domain: Domain, shape: FieldShape) -> None:
-        grid = HashGrid(shape.hash_levels, shape.hash_features, shape.hash_log2_table, shape.hash_min, shape.hash_max)
+        grid = HashGrid(shape.hash_levels, shape.hash_features, shape.log2_table, shape.hash_min, shape.finest)
         super().__init__(domain, shape, grid)
 
     def encode(self, positions: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ def refusal(shape: FieldShape) -> str | None:
         return "the kernels are not compiled"
     if shape.encoding == "hash" and shape.hash_features not in (1, 2, 4, 8):
         return f"an entry of the grid holds 1, 2, 4 or 8 features, not {shape.hash_features}"
-    if shape.encoding == "hash" and (shape.hash_levels > 16 or shape.hash_max > 1 << 19):
+    if shape.encoding == "hash" and (shape.hash_levels > 16 or shape.finest > 1 << 19):
         return "a grid has at most 16 levels of at most 2^19 cells"
     if max(shape.n_frequencies, shape.n_frequencies_dir) > 16:
         return "encodings have at most 16 frequencies"

@@ -101,11 +101,12 @@ class FieldState:
     network_gradient: Float
 
     def __init__(self, domain: Domain, shape: FieldShape, seed: int = 0) -> None:
+        shape = shape.settled()  # what a file says of it is exact
         self.domain, self.shape = domain, shape
         self.layers = layers_of(shape)
         self.levels: GridLevels | None = None
         if shape.encoding == "hash":
-            self.levels = GridLevels.of(shape.hash_levels, shape.hash_log2_table, shape.hash_min, shape.hash_max)
+            self.levels = GridLevels.of(shape.hash_levels, shape.log2_table, shape.hash_min, shape.finest)
         rng = np.random.Generator(np.random.Philox(seed))
         self.table = aligned_empty((self.levels.starts[-1] if self.levels else 0, shape.hash_features), np.float32)
         self.table[...] = rng.uniform(-1e-4, 1e-4, self.table.shape)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nerfvol.config.assemble import to_plain
 from nerfvol.config.field import FieldConfig
 from nerfvol.errors import InputError
 from nerfvol.field.counters import mixed
@@ -234,6 +235,7 @@ class CompiledFieldTrainer:
         """Everything that lives between steps, as arrays and numbers."""
         return {
             "field": self.state.arrays(),
+            "shape": to_plain(self.state.shape),  # a resumed run's may follow from another budget
             "grid": self.occupancy.state_dict(),
             "steps_done": self.steps_done,
             "n_rays": self.n_rays,

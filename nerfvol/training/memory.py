@@ -311,7 +311,7 @@ def field_memory(dataset: Dataset, config: FieldConfig, held_out_bytes: int) -> 
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
     backgrounds = 1 + (second_background(dataset, WHITE, len(dataset) <= config.few_views) is not None)
     images = dataset.nbytes + 3 * backgrounds * pixels // min(config.downscales) ** 2 + held_out_bytes
-    entries = shape.hash_levels * shape.hash_features << shape.hash_log2_table if shape.encoding == "hash" else 0
+    entries = shape.hash_levels * shape.hash_features << shape.log2_table if shape.encoding == "hash" else 0
     network = sum(layer.numbers for layer in layers_of(shape))
     field = 4 * 4 * (entries + network) + 4 * config.grid_resolution**3 * (1 + dataset.scene.n_shells)
     peak = BASE_BYTES + images + field

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from nerfvol.config.assemble import assemble
+from nerfvol.config.field import FieldShape
 from nerfvol.errors import InputError, shown
 from nerfvol.files.checkpoint import load_checkpoint
 
@@ -43,3 +46,14 @@ def _check_numbers(path: Path, state: dict[str, Any]) -> None:
     steps = state["steps"]
     if state["log_bytes"] < 0 or not all(type(n) is int and n >= 0 and name in PHASES for name, n in steps.items()):
         raise InputError(f"{path} is damaged: its counts are {shown(state['log_bytes'])} and {shown(steps)}")
+
+
+def field_begun(state: Mapping[str, Any], path: Path) -> FieldShape | None:
+    """The shape of the field that a run with ``state`` in its checkpoint has begun; None: it has begun none, or with a version
+    whose settings stated it all. InputError where the checkpoint at ``path`` states no shape there."""
+    shape = state["trainer"].get("shape") if state["phase"] == "field" else None
+    if shape is None:
+        return None
+    if not isinstance(shape, dict):
+        raise InputError(f"{path} is damaged: its field's shape is {shown(shape)}")
+    return assemble(FieldShape, (shape, f"{path}, its field's shape"))

@@ -33,6 +33,7 @@ from nerfvol.training.compiled_field import compiled_refusal
 from nerfvol.training.finishing import seconds_of_picture, seconds_to_finish, seconds_to_score
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder, is_simulated
+from nerfvol.training.saved import field_begun
 from nerfvol.views import OctreeModel, SplatModel
 
 PREVIEW_SHARE, PREVIEW_SECONDS = 0.01, 0.08
@@ -61,14 +62,14 @@ class Run:
         self.phase: str = self.saved["phase"]
         self.results: dict[str, Any] = self.saved["results"]
         self.steps: dict[str, int] = self.saved["steps"]
+        self.folder = Path(config.out)
+        self.checkpoint = self.folder / run_folder.CHECKPOINT
         begun = set(self.steps)
         if self.phase == "octree" and "converted" not in self.results:
             begun.discard("splats")  # they became no octree: it began with low density
         self.config = self._settled(begun)
         self.background: tuple[float, float, float] = self.config.background or WHITE
         self.clock, self.say = clock, say
-        self.folder = Path(config.out)
-        self.checkpoint = self.folder / run_folder.CHECKPOINT
         self.phase_started, self.running = 0.0, math.nan
         self.interrupted = False
         self.watch: Watch | None = None
@@ -89,6 +90,7 @@ class Run:
         side = sides[len(sides) // 2]
         if compiled_refusal(config.field) is None:  # in torch a field takes minutes and knows nothing of few views
             config = config.for_views(len(cameras), scene, is_simulated(config.data), begun, side)
+            config = config.for_field(len(cameras), scene, field_begun(self.saved, self.checkpoint))
         suited = config.for_scene(scene).for_pictures(side)
         return suited.before(self.data.training.backdrop)
 

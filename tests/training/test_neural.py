@@ -8,15 +8,21 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.config import field as config_field
+from nerfvol.config import training
 from nerfvol.config.field import FieldConfig, FieldShape
+from nerfvol.config.training import LONG_RUN
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.kernels.field_model import EARLY_STOP
 from nerfvol.measure.scores import evaluate
 from nerfvol.models import describe_file, load_model
 from nerfvol.neural import FieldModel
+from nerfvol.region import SceneBounds
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_start import make_final_trainer
+from nerfvol.training.memory import field_memory, gib
+from nerfvol.training.saved import field_begun
 from tests.fixtures.runs import TINY, metrics_of, settings, start
 from tests.training.test_field_trainer import ball_dataset
 
@@ -180,6 +186,70 @@ def test_resumes_and_repeats(run, tiny_scene, command, tmp_path):
     assert code == 2 and "compiled kernels alone: field.trainer is torch" in err and err.count("\n") == 1
     code, _, err = command("train", "--data", tiny_scene, "--representation", "field", "--init", "mlp", "--out", "r")
     assert code == 2 and "expected auto for field, got 'mlp'" in err
+
+
+UNSAID = {**TINY["field"], "shape": {"width": 16, "hash_levels": 4, "hash_min": 4}}  # tables that nobody chose
+
+
+@pytest.mark.parametrize("budget, more, tables", [
+    (LONG_RUN, {}, (19, 512)), (LONG_RUN - 1, {}, (17, 256)), (None, {}, (17, 256)),
+    (LONG_RUN, {"hash_log2_table": 12}, (12, 256)), (LONG_RUN, {"hash_max": 64}, (17, 64)),
+])  # fmt: skip
+def test_long_runs_have_larger_tables(budget, more, tables, tmp_path, tiny_scene):
+    """... where nobody chose their size; the estimate of memory follows. Not of few views, photographs, or octrees' fields."""
+    field = {**UNSAID, "shape": {**UNSAID["shape"], **more}}
+    config = settings(tiny_scene, tmp_path, representation="field", time_budget=budget, field=field)
+    config = dataclasses.replace(config, field=dataclasses.replace(config.field, shape=FieldShape(**field["shape"])))
+    box = np.array([[-1.0] * 3, [1.0] * 3])
+    shape = config.for_field(17, SceneBounds(box, None, True)).field.shape
+    assert (shape.log2_table, shape.finest) == (shape.hash_log2_table, shape.hash_max) == tables
+    # Numbers, two moments and gradients of four levels of pairs; the network and cells are less than a hundredth of a GiB.
+    described = field_memory(ball_dataset(), dataclasses.replace(config.field, shape=shape, grid_resolution=16), 0)
+    assert f"the field {gib(16 * 4 * 2 << tables[0])}" in described
+    few = dataclasses.replace(config, field=dataclasses.replace(config.field, few_views=17))
+    for other, scene in ((few, SceneBounds(box, None, True)), (config, SceneBounds(box, 4 * box, False))):
+        kept = other.for_field(17, scene).field.shape
+        assert (kept.log2_table, kept.finest) == (more.get("hash_log2_table", 17), more.get("hash_max", 256))
+    octree = dataclasses.replace(config, representation="octree")
+    assert octree.for_field(17, SceneBounds(box, None, True)) is octree
+
+
+def test_a_resumed_run_keeps_the_tables_it_began_with(tmp_path, tiny_scene, monkeypatch):
+    """Whatever its budget: begun with a long one, gone on with without one, and the other way round."""
+    monkeypatch.setattr(training, "LARGE_TABLES", {"hash_log2_table": 12, "hash_max": 48})
+    monkeypatch.setattr(config_field, "LOG2_TABLE", 9)
+    monkeypatch.setattr(config_field, "FINEST", 16)
+
+    def interrupt(run, phase, began_stage):
+        run.interrupted = True
+
+    for first, then, tables in ((LONG_RUN, None, (12, 48)), (None, LONG_RUN, (9, 16))):
+        field = {**UNSAID, "steps": 4}
+        out, said = tmp_path / f"{first}", []
+        config = settings(tiny_scene, out, representation="field", time_budget=first, field=field)
+        shape = dataclasses.replace(config.field.shape, hash_log2_table=None, hash_max=None)
+        config = dataclasses.replace(config, field=dataclasses.replace(config.field, shape=shape))
+        with pytest.raises(KeyboardInterrupt):
+            start(config, watch=interrupt)
+        with pytest.raises(KeyboardInterrupt):  # stopped once more: run.config's budget is the second one now
+            start(dataclasses.replace(config, resume=True, time_budget=then), watch=interrupt)
+        start(dataclasses.replace(config, resume=True, time_budget=None), say=said.append)
+        loaded = load_model(out / run_folder.FIELD)
+        assert isinstance(loaded, FieldModel)
+        shape = loaded.field.state.shape
+        assert (shape.hash_log2_table, shape.hash_max) == tables
+        assert not any("table" in sentence for sentence in said)
+
+
+def test_a_damaged_shape_in_a_checkpoint_is_one_sentence(tmp_path):
+    for shape, reason in (
+        ([1], "is damaged"),
+        ({"width": -1}, "its field's shape.*width"),
+        ({"wide": 1}, "unknown key"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            field_begun({"phase": "field", "trainer": {"shape": shape}}, tmp_path)
+    assert field_begun({"phase": "field", "trainer": {}}, tmp_path) is None  # of an earlier version
 
 
 HOSTILE = {
