@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 
 import numpy as np
 import pytest
@@ -230,9 +231,11 @@ def test_a_resumed_run_keeps_the_tables_it_began_with(tmp_path, tiny_scene, monk
         shape = dataclasses.replace(config.field.shape, hash_log2_table=None, hash_max=None)
         config = dataclasses.replace(config, field=dataclasses.replace(config.field, shape=shape))
         with pytest.raises(KeyboardInterrupt):
-            start(config, watch=interrupt)
+            start(config, started=time.perf_counter(), watch=interrupt)
         with pytest.raises(KeyboardInterrupt):  # stopped once more: run.config's budget is the second one now
-            start(dataclasses.replace(config, resume=True, time_budget=then), watch=interrupt)
+            start(
+                dataclasses.replace(config, resume=True, time_budget=then), started=time.perf_counter(), watch=interrupt
+            )
         start(dataclasses.replace(config, resume=True, time_budget=None), say=said.append)
         loaded = load_model(out / run_folder.FIELD)
         assert isinstance(loaded, FieldModel)
