@@ -30,12 +30,12 @@ MOST_THREADS = 1024
 """More help on no machine, and tens of thousands are refused by the system in the middle of the work."""
 SHORT_RUN = 10.0
 """Seconds of a time budget up to which an octree of an object begins with low density: distilling a field would take most of
-them, and splats and their conversion too many (lego, 10 s: 23.6 instead of 24.2 dB)."""
+them, and splats and their conversion too many (lego, 10 s: 22.0 instead of 24.0 dB)."""
 SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
 """... and from there up to which that of an object that many views show begins as splats, or up to so many seconds for each
 pixel of the pictures' shorter side, whichever is later; longer runs begin with a field. Fog takes most of the time to become
-surfaces (lego 400x400, 1 minute: 33.5 dB from splats, 33.4 from a field, 33.2 from fog; 800x800, 2 minutes: 33.3, 32.8, 32.3,
-5 minutes: 35.0, 35.2, 34.7; docs/performance.md)."""
+surfaces (lego 400x400, 1 minute: 33.4 dB from splats, 33.4 from a field, 33.2 from fog, 2 minutes: 34.3 and 34.7 from a field;
+800x800, 2 minutes: 33.6, 32.8, 32.3, 5 minutes: 35.0, 35.2, 34.7; docs/performance.md)."""
 LONG_RUN = 45.0
 """Seconds of a time budget from which on a field that is the product has larger tables, ..."""
 LARGE_TABLES: dict[str, Any] = {"hash_log2_table": 19, "hash_max": 512}
