@@ -46,7 +46,7 @@ class FieldShape(Checked):
     hash_log2_table: Annotated[int, within(4, 24)] = 17
     """Entries of a table of the hash encoding, as a power of two."""
     hash_min: Count = 16
-    """Cells along an edge of the coarsest grid."""
+    """Cells along an edge of the coarsest grid; at most 8 where few views train by the compiled kernels."""
     hash_max: Count = 256
     """Cells along an edge of the finest grid."""
     width: Count = 32
