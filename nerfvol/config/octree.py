@@ -164,6 +164,10 @@ class OctreeConfig(Checked):
         columns["prunes"] = [min(n, 1) for n in columns["prunes"][:-1]] + columns["prunes"][-1:]
         return dataclasses.replace(self, **columns)
 
+    def no_finer_than(self, level: int) -> OctreeConfig:
+        """The same with stages that split no leaf beyond ``level``."""
+        return dataclasses.replace(self, levels=[min(each, level) for each in self.levels])
+
     def _with_levels_to(self, finest: int) -> OctreeConfig:
         """The same with one more stage for each level after the last one's, to ``finest``."""
         levels, ends = [*self.levels], [*self.stage_ends]

@@ -154,8 +154,9 @@ class Dataset:
         Raises:
             InputError: k is not between 1 and 256.
         """
-        keep = then or _itself
-        return self.before_each([background], k, lambda pictures: keep(pictures[0]))
+        if then is None:
+            return self.before_each([background], k, lambda pictures: pictures[0])
+        return self.before_each([background], k, lambda pictures: then(pictures[0]))
 
     def before_each(
         self, backgrounds: Sequence[Sequence[float]], k: int, then: Callable[[list[UInt8]], Made]
@@ -184,7 +185,3 @@ class Dataset:
 def evenly(n: int, most: int) -> list[int]:
     """``most`` of n > 1 places in order, evenly chosen, the first and the last among them."""
     return np.linspace(0, n - 1, most).round().astype(int).tolist()
-
-
-def _itself(image: UInt8) -> UInt8:
-    return image
