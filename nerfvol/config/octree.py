@@ -94,7 +94,8 @@ class OctreeConfig(Checked):
     """The step from which on both count. None: 1000, for at first objects have nothing that could overfit; 0 in photographs."""
     two_backgrounds: bool | None = None
     """Cut-out pictures are seen before their background and the colour farthest from it in turn, so that what has the
-    background's colour is not for nothing. None: where few views show an object (field.few_views)."""
+    background's colour is not for nothing. None: where few views show an object (field.few_views), by which alone a field has
+    both."""
     regulariser_decay: Decay = 0.1
     """The weights of all four terms shrink exponentially to this factor over the run."""
     rate_density: Rate = 0.3
