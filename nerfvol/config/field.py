@@ -46,7 +46,7 @@ class FieldShape(Checked):
     hash_log2_table: Annotated[int, within(4, 24)] = 17
     """Entries of a table of the hash encoding, as a power of two."""
     hash_min: Count = 16
-    """Cells along an edge of the coarsest grid; at most 8 where few views train by the compiled kernels."""
+    """Cells along an edge of the coarsest grid."""
     hash_max: Count = 256
     """Cells along an edge of the finest grid."""
     width: Count = 32
@@ -124,7 +124,7 @@ class FieldConfig(Checked):
     few_views: Annotated[int, at_least(0)] = 16
     """... and with so many training pictures or fewer that is what matters most: then it is ..."""
     few_decay: Weight = 3e-5
-    """... this, colours do not depend on the direction, ..."""
+    """... this, colours do not depend on the direction, the coarsest grid has at most 8 cells along an edge, ..."""
     few_entropy: Weight = 0.01
     """... and the entropy of a ray's opacity has this weight."""
     sparsity_weight: Weight = 0.0
