@@ -19,6 +19,10 @@ class InputError(ValueError):
     """
 
 
+class EmptyModel(InputError):
+    """What was trained came out empty: there may be another way to begin."""
+
+
 def shown(value: Any) -> str:
     """``value`` as a sentence shows it: its repr, shortened, so that what came from a file cannot grow when it is told."""
     try:

@@ -75,11 +75,12 @@ def subset_of_photographs(data: Path, out: Path, n: int) -> Path:
         raise SystemExit(f"starts: --views: {data} has {len(training)} training views, got {n}")
     folder = out / f"{data.name}_{n}"
     folder.mkdir(parents=True, exist_ok=True)
-    for entry in data.iterdir():
-        if not (folder / entry.name).exists():
+    lists = {"train.txt": [training[i] for i in evenly(len(training), n)], "val.txt": held_out}
+    for entry in data.iterdir():  # the data's own lists are not linked to, for they would be written over
+        if entry.name not in lists and not (folder / entry.name).exists():
             (folder / entry.name).symlink_to(entry.resolve())
-    for split, names in (("train", [training[i] for i in evenly(len(training), n)]), ("val", held_out)):
-        (folder / f"{split}.txt").write_text("\n".join(names))
+    for name, names in lists.items():
+        (folder / name).write_text("\n".join(names))
     return folder
 
 

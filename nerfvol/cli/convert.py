@@ -124,6 +124,7 @@ def _converted(
     """``seen``: the images' cameras and bounds; ``training``: the images, where there is time to train on them; ``scored``:
     views that the result will be compared on."""
     from nerfvol.clouds import PointModel
+    from nerfvol.config.octree import OctreeConfig
     from nerfvol.config.training import Config
     from nerfvol.neural import FieldModel
     from nerfvol.starts.gaussians import splats_of_leaves
@@ -135,7 +136,8 @@ def _converted(
         scene, cameras = convert.scene_around(model), convert.cameras_around(model)
     else:
         scene, cameras = seen[1], convert.small_cameras(*seen)
-    config = Config(time_budget=options.time_budget, seed=options.seed)
+    octree = OctreeConfig() if options.level is None else OctreeConfig().no_finer_than(options.level)
+    config = Config(time_budget=options.time_budget, seed=options.seed, octree=octree)
     metadata = {k: v for k, v in model.metadata.items() if k in ("orbit", "provenance")} | {
         "background": list(background)
     }

@@ -142,7 +142,7 @@ class FieldConfig(Checked):
     few_views: Annotated[int, at_least(0)] = 16
     """... and with so many training pictures or fewer that is what matters most: then it is ..."""
     few_decay: Weight = 3e-5
-    """... this, colours do not depend on the direction, ..."""
+    """... this, colours do not depend on the direction, the coarsest grid has at most 8 cells along an edge, ..."""
     few_entropy: Weight = 0.01
     """... and the entropy of a ray's opacity has this weight."""
     sparsity_weight: Weight = 0.0

@@ -94,7 +94,8 @@ class OctreeConfig(Checked):
     """The step from which on both count. None: 1000, for at first objects have nothing that could overfit; 0 in photographs."""
     two_backgrounds: bool | None = None
     """Cut-out pictures are seen before their background and the colour farthest from it in turn, so that what has the
-    background's colour is not for nothing. None: where few views show an object (field.few_views)."""
+    background's colour is not for nothing. None: where few views show an object (field.few_views), by which alone a field has
+    both."""
     regulariser_decay: Decay = 0.1
     """The weights of all four terms shrink exponentially to this factor over the run."""
     rate_density: Rate = 0.3
@@ -163,6 +164,10 @@ class OctreeConfig(Checked):
         columns = {name: [row[i] for row in kept] for i, name in enumerate(names)}
         columns["prunes"] = [min(n, 1) for n in columns["prunes"][:-1]] + columns["prunes"][-1:]
         return dataclasses.replace(self, **columns)
+
+    def no_finer_than(self, level: int) -> OctreeConfig:
+        """The same with stages that split no leaf beyond ``level``."""
+        return dataclasses.replace(self, levels=[min(each, level) for each in self.levels])
 
     def _with_levels_to(self, finest: int) -> OctreeConfig:
         """The same with one more stage for each level after the last one's, to ``finest``."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeVar, overload
+from typing import TYPE_CHECKING, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,16 +154,24 @@ class Dataset:
         Raises:
             InputError: k is not between 1 and 256.
         """
+        if then is None:
+            return self.before_each([background], k, lambda pictures: pictures[0])
+        return self.before_each([background], k, lambda pictures: then(pictures[0]))
+
+    def before_each(
+        self, backgrounds: Sequence[Sequence[float]], k: int, then: Callable[[list[UInt8]], Made]
+    ) -> list[Made]:
+        """What ``then`` makes of every image over each of the ``backgrounds``, averaged as by :meth:`pyramid`, which raises the
+        same: of one image at a time."""
         if not 1 <= k <= 256:
             raise InputError(f"the pyramid's factor must be an integer between 1 and 256, got {k}")
-        keep = then or _itself
 
-        def make(i: int) -> Any:
-            mask = self.mask(i)
+        def make(i: int) -> Made:
+            image, mask = self.images[i], self.mask(i)
             if mask is None or k == 1:
-                return keep(composite_average(self.images[i], background, k))
-            whole = composite_average(self.images[i], background, 1)
-            return keep(masked_average(whole, mask, k)[0])
+                return then([composite_average(image, background, k) for background in backgrounds])
+            wholes = [composite_average(image, background, 1) for background in backgrounds]
+            return then([masked_average(whole, mask, k)[0] for whole in wholes])
 
         return map_threads(make, range(len(self)), self.threads)
 
@@ -177,7 +185,3 @@ class Dataset:
 def evenly(n: int, most: int) -> list[int]:
     """``most`` of n > 1 places in order, evenly chosen, the first and the last among them."""
     return np.linspace(0, n - 1, most).round().astype(int).tolist()
-
-
-def _itself(image: UInt8) -> UInt8:
-    return image

@@ -313,6 +313,11 @@ def composite_average(image: UInt8, background: Sequence[float], k: int) -> UInt
     return out
 
 
+def plain_colour(background: Sequence[float]) -> UInt8:
+    """The colour (3,) of what is transparent before ``background``, as :func:`composite_average` rounds it: 127.5 to 127."""
+    return composite_average(np.zeros((1, 1, 4), np.uint8), background, 1)[0, 0]
+
+
 def masked_average(image: UInt8, mask: UInt8, k: int) -> tuple[UInt8, UInt8]:
     """The image (h, w, 3 or 4) and its mask (h, w), area-averaged by k: colours of the part that is not masked alone.
 

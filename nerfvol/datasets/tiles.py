@@ -9,7 +9,7 @@ import numpy as np
 
 from nerfvol.cameras.camera import Intrinsics, tile_pixels, tile_rays
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import composite_average
+from nerfvol.datasets.images import plain_colour
 from nerfvol.errors import InputError, shown
 from nerfvol.kernels.state import TILE_RAYS, Batch
 from nerfvol.native import native
@@ -57,12 +57,10 @@ class TileBank:
     def __init__(
         self, dataset: Dataset, background: Sequence[float], k: int, second: Sequence[float] | None = None
     ) -> None:
-        if second is None:
-            sorted_out = dataset.pyramid(background, k, lambda image: _sort_out([_tiled(image)], [background]))
-        else:
-            both = [background, second]
-            first, then = (dataset.pyramid(colour, k, _tiled) for colour in both)
-            sorted_out = [_sort_out(pair, both) for pair in zip(first, then, strict=True)]
+        backgrounds = [background] if second is None else [background, second]
+        sorted_out = dataset.before_each(
+            backgrounds, k, lambda pictures: _sort_out([_tiled(picture) for picture in pictures], backgrounds)
+        )
         self.pixels = [pixels[0] for pixels, _ in sorted_out]
         self.second_pixels = [pixels[-1] for pixels, _ in sorted_out]
         self.row = np.concatenate([row for _, row in sorted_out])
@@ -178,10 +176,7 @@ def _sort_out(
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Of an image's ``tiles`` (n, 64, 3) before each of the ``backgrounds``: pixels (1 + foreground tiles, 64, 3), a background
     tile first; and which of these each tile is, (n,)."""
-    clear = np.zeros(
-        (1, 1, 4), np.uint8
-    )  # the colour that compositing gives: it may round 127.5 another way than np.round
-    plain = [np.tile(composite_average(clear, b, 1), (1, TILE_RAYS, 1)) for b in backgrounds]
+    plain = [np.tile(plain_colour(background), (1, TILE_RAYS, 1)) for background in backgrounds]
     foreground = np.any([(t != p).any((1, 2)) for t, p in zip(tiles, plain, strict=True)], axis=0)
     pixels = [np.concatenate([p, t[foreground]]) for t, p in zip(tiles, plain, strict=True)]
     return pixels, np.where(foreground, np.cumsum(foreground), 0).astype(np.int32)

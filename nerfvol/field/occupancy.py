@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nerfvol.errors import InputError
+from nerfvol.errors import EmptyModel, InputError
 from nerfvol.field.fields import NeuralField
 from nerfvol.field.layout import GROUP, Domain, step_edges
 from nerfvol.field.sampling import intersect_aabb
@@ -86,9 +86,9 @@ class OccupancyGrid:
         return float(self.occupied[: self.resolution**3].float().mean())
 
     def check_not_empty(self) -> None:
-        """Raise InputError when nothing is left: the field has collapsed to empty space."""
+        """Raise EmptyModel when nothing is left: the field has collapsed to empty space."""
         if not bool(self.occupied.any()):
-            raise InputError(
+            raise EmptyModel(
                 "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
                 "the images' background and that the scene bounds contain the object, lower field.rate or "
                 "field.sparsity_weight, or start with --init direct"

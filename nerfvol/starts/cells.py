@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 
 from nerfvol.config.field import DistillConfig
-from nerfvol.errors import InputError
+from nerfvol.errors import EmptyModel
 from nerfvol.field.layout import Domain, PointField
 from nerfvol.native import native
 from nerfvol.octree.topology import OFFSETS
@@ -84,7 +84,7 @@ def candidate_cells(
     (:func:`finer_cells`). Only where the coarsest do not fit either, the thinnest are left out.
 
     Raises:
-        InputError: nothing in the field is opaque enough for a leaf.
+        EmptyModel: nothing in the field is opaque enough for a leaf.
     """
     level, threshold = cast(int, config.level), -math.log1p(-config.empty_opacity)
     start = max(1, config.coarse_level + frame.finest - level)
@@ -100,7 +100,7 @@ def candidate_cells(
             f"{config.max_leaves:,} leaves"
         )
     if not len(found[0]):
-        raise InputError(
+        raise EmptyModel(
             "the field is empty: nothing in it is opaque enough for a leaf; train it longer, check the background "
             "colour and the scene bounds, or use --init direct"
         )

@@ -22,7 +22,7 @@ import numpy as np
 from nerfvol.cameras.camera import Camera
 from nerfvol.config.field import DistillConfig
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.errors import InputError
+from nerfvol.errors import EmptyModel
 from nerfvol.field.layout import Domain, PointField
 from nerfvol.machine import return_free_memory
 from nerfvol.measure.scores import evaluate, score_views
@@ -88,7 +88,7 @@ def distill(
         render_field: camera -> (h, w, 3) image of the field; None: no comparison is made (PSNRs are NaN).
 
     Raises:
-        InputError: the field is empty: nothing in it is as opaque as ``empty_opacity``.
+        EmptyModel: the field is empty: nothing in it is as opaque as ``empty_opacity``.
     """
     config = config.for_scene(dataset.scene)
     level, messages = cast(int, config.level), []
@@ -148,12 +148,12 @@ class _Sieve:
         return merged
 
     def seen(self, octree: Octree) -> Octree:
-        """The octree without what no view needs, judged by the larger leaves that it would merge to; InputError where nothing
+        """The octree without what no view needs, judged by the larger leaves that it would merge to; EmptyModel where nothing
         is left."""
         judged = merge_smooth(octree, self.config.coarse_level, self.config.merge_tolerance)
         keep = needed(judged, self.dataset, self.background, self.config.prune_weight)
         if not keep.any():
-            raise InputError(
+            raise EmptyModel(
                 "the field holds nothing that the training views can see; train it longer or use --init direct"
             )
         if keep.all():

@@ -244,7 +244,7 @@ def octree_of_field(
 ) -> Octree:
     """The octree that a field is distilled to (starts/field.py); ``seen``: pictures of it, which say what is visible.
 
-    level: of the finest leaves, along the inner cube; None: as in training.
+    level: of the finest leaves, along the inner cube; None: as in training on many views.
 
     Raises:
         InputError: the field is empty, or nothing of it is seen.

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from nerfvol.errors import InputError
+from nerfvol.errors import EmptyModel
 from nerfvol.kernels import field_ops
 from nerfvol.kernels.field_ops import FieldState, Occupancy
 
@@ -30,7 +30,7 @@ def look(state: FieldState, grid: Occupancy, seed: int, step: int) -> None:
     """After ``step`` steps: look at what is due, if anything, and derive anew which cells are occupied.
 
     Raises:
-        InputError: nothing is left.
+        EmptyModel: nothing is left.
     """
     rng = np.random.Generator(np.random.Philox(key=[seed, 1 + step]))
 
@@ -54,7 +54,7 @@ def look(state: FieldState, grid: Occupancy, seed: int, step: int) -> None:
         return
     grid.refresh()
     if grid.thickest() < 1 / (255 * math.sqrt(3) * grid.resolution):  # a whole ray would not change an 8-bit colour
-        raise InputError(
+        raise EmptyModel(
             "the field collapsed to empty space: no cell of the scene holds anything; check that --background is "
             "the images' background and that the scene bounds contain the object, lower field.rate, or start with "
             "--init direct"

@@ -350,7 +350,9 @@ class OctreePlan:
         share = foreground_share(dataset, config.background or WHITE)
         pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
         self.foreground_tiles = max(share, 0.01) * pixels / TILE_RAYS
-        backgrounds = 1 + (second_background(dataset, WHITE, bool(config.octree.two_backgrounds)) is not None)
+        in_field = config.init == "mlp" and len(dataset) <= config.field.few_views
+        two = second_background(dataset, WHITE, bool(config.octree.two_backgrounds) or in_field) is not None
+        backgrounds = 1 + two
         self._other = OtherMemory(
             share, held_out_bytes, field=config.init == "mlp", splats=splats, backgrounds=backgrounds
         )

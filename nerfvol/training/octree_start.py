@@ -17,7 +17,7 @@ from typing import Any
 from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
-from nerfvol.errors import InputError
+from nerfvol.errors import EmptyModel, InputError
 from nerfvol.files import run_folder
 from nerfvol.kernels import ops
 from nerfvol.machine import return_free_memory
@@ -64,8 +64,26 @@ def why_start(config: Config, n_views: int, photographs: bool = False) -> str | 
     return None
 
 
-def start_from_field(run: Run, optimise: Optimise) -> Octree:
-    """Trains the field and distils it; the octree, and the scores of both among the run's results."""
+def start_from_field(run: Run, optimise: Optimise) -> Octree | None:
+    """Trains the field and distils it; the octree, and the scores of both among the run's results.
+
+    None, with a sentence, where nobody asked for a field and it came out empty: low density is left to begin with.
+
+    Raises:
+        EmptyModel: a field was asked for, and there is nothing in it.
+    """
+    try:
+        return _distilled(run, optimise)
+    except EmptyModel:
+        if run.given.init != "auto":
+            raise
+        run.results.pop("field", None)
+        run.with_low_density()
+        run.say("start: low density, for the field came out empty; are the background and the scene bounds right?")
+        return None
+
+
+def _distilled(run: Run, optimise: Optimise) -> Octree:
     from nerfvol.starts.field import distill
 
     config, background, data = run.config, run.background, run.data
@@ -112,7 +130,7 @@ def planned_splats(run: Run) -> SplatPlan | None:
     except InputError as error:
         if run.given.init != "auto" or run.phase == "splats":
             raise
-        run.without_splats()
+        run.with_low_density()
         run.say(f"start: low density, for there can be no splats first: {error}")
         return None
 
@@ -205,7 +223,7 @@ def start_from_splats(
     except InputError as error:
         if run.given.init != "auto":
             raise
-        run.without_splats()
+        run.with_low_density()
         run.say(f"start: low density, for the splats became no octree: {error}")
         return None
     converted = OctreeModel(octree, run.metadata())

@@ -86,6 +86,8 @@ class OctreeTrainer(GrowingOctree):
         # A given octree enters at the stage whose finest level it has, where full progress of that stage is still ahead.
         self.stage = 0 if octree is None else first_stage(config, octree, dataset.scene)
         self.first_stage = self.stage
+        if octree is not None and self.stage + 1 == len(config.levels):
+            self._grow_sh_at_last()
         self.keeps_solid = octree is not None and len(dataset) < ENOUGH_VIEWS
         self.steps_done, self._progress = 0, 0.0
         self.stage_steps = np.zeros(len(config.levels), np.int64)
@@ -256,11 +258,16 @@ class OctreeTrainer(GrowingOctree):
             if transfer is None:
                 break
             error, footprint = error[transfer.parent] / 8, footprint[transfer.parent] / 2
-        if self.stage + 1 == len(c.levels) and c.final_sh_degree > self.octree.sh_degree:
-            self.grow_sh(c.final_sh_degree)
+        if self.stage + 1 == len(c.levels):
+            self._grow_sh_at_last()
         if c.downscales[old] != c.downscales[self.stage]:
             self.bank = None
             self.cursors = Cursors()
+
+    def _grow_sh_at_last(self) -> None:
+        """What the last stage begins with, which may be a given octree's first."""
+        if self.config.final_sh_degree > self.octree.sh_degree:
+            self.grow_sh(self.config.final_sh_degree)
 
     def _split(self, error: np.ndarray, footprint: np.ndarray, share: float) -> Transfer | None:
         """Splits the leaves that this stage wants finer, among those that hold ``share`` of the error; None: there are none.

@@ -10,14 +10,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from nerfvol.config.assemble import read_yaml, to_plain, write_yaml
+from nerfvol.config.assemble import assemble, read_yaml, to_plain, write_yaml
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.fingerprint import changes, fingerprint
 from nerfvol.datasets.frame import Frame
-from nerfvol.datasets.images import composite_average
+from nerfvol.datasets.images import composite_average, plain_colour
 from nerfvol.datasets.load import load_dataset
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
@@ -72,7 +70,7 @@ def check_folder(config: Config) -> Path:
     """
     run = ensure_writable_folder(config.out)
     if config.resume:
-        _refuse_changes(read_yaml(run / CONFIG), to_plain(config))
+        _refuse_changes(_as_begun(run / CONFIG), to_plain(config))
     return run
 
 
@@ -89,15 +87,23 @@ def claim_folder(config: Config) -> None:
     write_yaml(run / CONFIG, to_plain(config) | {"resume": False})
 
 
+def _as_begun(path: Path) -> dict[str, Any]:
+    """The settings in a run's file, each by its present name; of those that the run's version did not know what they are where
+    nobody chose them."""
+    # What it began with, a file perhaps, is not asked for again.
+    layers = (read_yaml(path), str(path)), ({"resume": True}, str(path))
+    return to_plain(assemble(Config, *layers, say=lambda sentence: None))
+
+
 def _refuse_changes(old: dict[str, Any], new: dict[str, Any]) -> None:
     """An InputError where a resumed run is asked for other settings than the ones it was begun with."""
     for key, value in new.items():
-        before = old.get(key, value)
+        before = old[key]
         if key in _FREE or before == value:
             continue
         if isinstance(value, dict) and isinstance(before, dict):
-            inner = next(name for name in value if before.get(name) != value[name])
-            key, before, value = f"{key}.{inner}", before.get(inner), value[inner]
+            inner = next(name for name in value if before[name] != value[name])
+            key, before, value = f"{key}.{inner}", before[inner], value[inner]
         raise InputError(
             f"--resume: the run was begun with {key} = {before}, which cannot become {value} half-way; "
             "leave the option out, or train again from the start"
@@ -242,7 +248,7 @@ def require_scorable(held_out: Dataset) -> None:
 
 def require_something(dataset: Dataset, background: Sequence[float]) -> None:
     """An InputError where every pixel of every picture has the background's colour: there is nothing to reconstruct."""
-    plain = np.round(np.asarray(background) * 255)
+    plain = plain_colour(background)
     if all((composite_average(image, background, 1) == plain).all() for image in dataset.images):
         colour = ",".join(f"{c:g}" for c in background)
         raise InputError(

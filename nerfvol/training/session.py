@@ -43,6 +43,9 @@ LOOK_AGAIN = 0.08
 RUNNING = 0.98
 """Memory, per step, of the running error."""
 
+BECAME = {"splats": "converted", "field": "distilled"}
+"""Phases before the octree, and the row of the results that says that they became one."""
+
 Say = Callable[[str], object]
 Watch = Callable[["Run", Phase, bool], object]
 """Sees a run, its phase after a step, and whether that step began a stage."""
@@ -65,8 +68,8 @@ class Run:
         self.folder = Path(config.out)
         self.checkpoint = self.folder / run_folder.CHECKPOINT
         begun = set(self.steps)
-        if self.phase == "octree" and "converted" not in self.results:
-            begun.discard("splats")  # they became no octree: it began with low density
+        if self.phase == "octree":  # what became no octree left it to begin with low density
+            begun -= {first for first, became in BECAME.items() if became not in self.results}
         self.config = self._settled(begun)
         self.background: tuple[float, float, float] = self.config.background or WHITE
         self.clock, self.say = clock, say
@@ -94,8 +97,8 @@ class Run:
         suited = config.for_scene(scene).for_pictures(side)
         return suited.before(self.data.training.backdrop)
 
-    def without_splats(self) -> None:
-        """What was to begin as splats, and nobody asked for it, begins with low density: there can be none."""
+    def with_low_density(self) -> None:
+        """What was to begin as splats or a field, and nobody asked for it, begins with low density: there can be none."""
         self.config = self._settled(("octree",))
 
     def enter(self, phase: Phase) -> None:

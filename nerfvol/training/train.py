@@ -42,6 +42,7 @@ from nerfvol.training.few_views import few_views
 from nerfvol.training.field_start import make_final_trainer
 from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, photographs_bytes, splat_memory
 from nerfvol.training.octree_start import (
+    SplatPlan,
     planned_splats,
     settings_of_octree,
     start_from_field,
@@ -166,9 +167,15 @@ def begin_octree(run: Run) -> OctreeTrainer:
     """The trainer of an octree: from low density, or from a field or splats that are trained first."""
     data = run.data
     splats = planned_splats(run) if run.config.init == "splats" and run.phase in ("start", "splats") else None
-    bytes_of_splats, leaves = (splats.bytes, splats.leaves) if splats is not None else (0, 0)
-    grows = splats is not None and splats.stage is None
-    plan = OctreePlan(run.config, data.training, data.held_out_bytes, bytes_of_splats, leaves, grows)
+    try:
+        plan = _plan_of(run, splats)
+    except InputError as error:
+        if splats is None or run.given.init != "auto" or run.phase == "splats":
+            raise
+        splats = None
+        run.with_low_density()
+        plan = _plan_of(run, None)  # or there is no memory for any
+        run.say(f"start: low density, for with splats first {error}")
     announce(run, plan.sentence())
     photographs = data.training.scene.is_unbounded
     if run.config.init != run.given.init and (chosen := why_start(run.config, len(data.training), photographs)):
@@ -184,6 +191,14 @@ def begin_octree(run: Run) -> OctreeTrainer:
         octree = start_from_field(run, optimise)
     settings = settings_of_octree(run)
     return OctreeTrainer(data.training, run.background, settings, run.config.seed, octree, plan, appearance)
+
+
+def _plan_of(run: Run, splats: SplatPlan | None) -> OctreePlan:
+    """How large the octree may become, of ``splats`` or of what takes no memory before; InputError where nothing fits."""
+    training, held_out = run.data.training, run.data.held_out_bytes
+    if splats is None:
+        return OctreePlan(run.config, training, held_out)
+    return OctreePlan(run.config, training, held_out, splats.bytes, splats.leaves, splats.stage is None)
 
 
 def begin_field(run: Run) -> CompiledFieldTrainer:

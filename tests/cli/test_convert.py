@@ -40,10 +40,18 @@ def test_there_and_back_with_and_without_images(tmp_path, tiny_scene, command, o
         "convert", octree_file, "--to", "splats", "--data", tiny_scene, "--time-budget", "0.3s", "--out", tuned
     )
     assert code == 0 and "steps on the photographs" in out and load_model(tuned).metadata["near"] > 0, err
+    tune, asked = convert.tuned_octree, []
+
+    def watched(octree, dataset, background, config, *more):
+        asked.append(config.octree)
+        return tune(octree, dataset, background, config, *more)
+
+    monkeypatch.setattr(convert, "tuned_octree", watched)
     code, out, err = command(
         "convert", splats, "--to", "octree", "--level", 5, "--data", tiny_scene, "--time-budget", "0.3s", "--out", again
     )
     assert code == 0 and "steps on the photographs" in out, err
+    assert max(asked[0].levels) == 5  # no stage splits what was asked for
 
 
 def test_convert_and_export_make_the_same_splats(tmp_path, command, octree_file):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
-from nerfvol.datasets import tiles
+from nerfvol.datasets import dataset as dataset_module
+from nerfvol.datasets import images, tiles
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.tiles import Cursor, Cursors, TileBank
 from nerfvol.kernels.state import TILE_RAYS
@@ -170,6 +171,25 @@ def test_the_angle_of_a_pixel(odd):
     assert one.pixel_angle == pytest.approx(np.median([1 / (1.3 * w) for w in (20, 24, 20, 13)]))
     # A scaled lens drops what does not fill a block, but its focal length is exactly half.
     assert two.pixel_angle == pytest.approx(2 * one.pixel_angle)
+
+
+def test_two_backgrounds_are_made_a_picture_at_a_time(odd, monkeypatch):
+    """All pictures before both would be in memory at once, of which the tiles that are kept are a fraction."""
+    made = []
+
+    def sort_out(pictures, backgrounds):
+        made.append("sorted")
+        return tiles_of(pictures, backgrounds)
+
+    def composited(image, background, k):
+        made.append("composited")
+        return composite_average(image, background, k)
+
+    tiles_of, composite_average = tiles._sort_out, images.composite_average
+    monkeypatch.setattr(tiles, "_sort_out", sort_out)
+    monkeypatch.setattr(dataset_module, "composite_average", composited)
+    TileBank(dataclasses.replace(odd, threads=1), WHITE, 1, (0.0, 0.0, 0.0))
+    assert made == ["composited", "composited", "sorted"] * len(odd)
 
 
 def test_without_compiled_code_the_batch_is_the_same(odd, monkeypatch):

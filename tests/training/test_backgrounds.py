@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from nerfvol.config.field import FieldConfig
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.training.backgrounds import farthest, second_background
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_phase import domain_of
+from nerfvol.training.memory import OctreePlan
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.views import render_image
 from tests.training.test_compiled_field import SMALL
@@ -68,6 +70,16 @@ def test_runs_of_few_views_have_two(white_ball):
         config = Config(data="d", out="o", octree=dataclasses.replace(OctreeConfig(), two_backgrounds=said))
         settled = config.for_views(n, scene).for_scene(scene)
         assert settled.octree.two_backgrounds is has
+
+
+@pytest.mark.parametrize("two, init, few, held", [
+    (False, "mlp", 16, 2), (False, "direct", 16, 1), (True, "direct", 0, 2), (False, "mlp", 0, 1),
+])  # fmt: skip
+def test_memory_counts_the_backgrounds_of_field_and_octree(white_ball, two, init, few, held):
+    """The field of few views has both, whatever is said of the octree."""
+    sections = {"octree": OctreeConfig(two_backgrounds=two), "field": FieldConfig(few_views=few)}
+    plan = OctreePlan(Config(data="d", out="o", init=init, **sections), white_ball, 0)
+    assert plan._other.backgrounds == held
 
 
 def test_the_same_bits_resumed_after_an_odd_step(compiled, white_ball):

@@ -1,8 +1,12 @@
 """Few photographs: what may be expected of them is said before a run, and only then."""
 
+from types import SimpleNamespace
+
 import pytest
 
+from nerfvol.datasets import load
 from nerfvol.training.few_views import OBJECTS, PHOTOGRAPHS, few_views
+from tools import starts
 
 
 @pytest.mark.parametrize("n,photographs,said", [
@@ -14,3 +18,18 @@ def test_what_few_views_let_expect(n, photographs, said):
     assert sentence is None if said is None else sentence.startswith(f"{n} training views are few") and said in sentence
     known = list((PHOTOGRAPHS if photographs else OBJECTS).values())
     assert known == sorted(known)
+
+
+def test_few_of_photographs_leave_the_lists_of_their_data_alone(tmp_path, monkeypatch):
+    """A link to a list, written through, would be the data's own."""
+    data = tmp_path / "data"
+    data.mkdir()
+    for name in ("train.txt", "val.txt", "a.jpg"):
+        (data / name).write_text("a\nb\nc")
+    names = {"train": ["a", "b", "c"], "val": ["d"]}
+    monkeypatch.setattr(load, "load_dataset", lambda path, split: SimpleNamespace(names=names[split]))
+    for _ in range(2):
+        folder = starts.subset(data, tmp_path / "out", 2)
+        assert [(folder / f"{split}.txt").read_text() for split in ("train", "val")] == ["a\nc", "d"]
+        assert {(data / name).read_text() for name in ("train.txt", "val.txt")} == {"a\nb\nc"}
+        assert (folder / "a.jpg").is_symlink()

@@ -107,6 +107,23 @@ def test_another_budget_does_not_choose_another_start_half_way(tmp_path, tiny_sc
         assert Run(config, data, Clock(0.0, 0.0), both).config.init == init
 
 
+def test_splats_whose_octree_fits_nowhere_leave_low_density(tmp_path, tiny_scene, monkeypatch):
+    """... where nobody asked for them: an octree that grows as memory allows needs less."""
+    monkeypatch.setattr(octree_start, "starting_splats_bytes", lambda *_: 1 << 60)
+    said = []
+    for init in ("auto", "splats"):
+        (tmp_path / init).mkdir()
+        run = run_of(settings(tiny_scene, tmp_path / init, time_budget=20.0, init=init))
+        run.say = said.append
+        assert run.config.init == "splats"
+        if init == "splats":
+            with pytest.raises(InputError, match="training would need"):
+                train.begin_octree(run)
+        else:
+            assert train.begin_octree(run).first_stage == 0 and run.config.init == "auto"
+            assert any("start: low density, for with splats first training would need" in sentence for sentence in said)
+
+
 @pytest.mark.parametrize("name", ["truth.npz", "provenance.json"])
 def test_what_lies_beside_simulated_images(tmp_path, name):
     transforms = tmp_path / "transforms_train.json"

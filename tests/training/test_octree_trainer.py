@@ -18,6 +18,7 @@ from nerfvol.octree.rows import DENSITY_SLOT, explin_inverse
 from nerfvol.octree.topology import MAX_LEVEL
 from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
+from nerfvol.starts.fog import low_density_octree
 from nerfvol.training import octree_schedule
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.views import render_image
@@ -133,6 +134,21 @@ def test_the_last_pruning_of_a_resumed_run_without_a_step_is_the_same(tiny_scene
         again.load_state_dict(
             {**OctreeTrainer(first.dataset, (1, 1, 1), config).state_dict(), "progress": float("nan")}
         )
+
+
+def test_one_stage_of_a_given_octree_is_the_last(tiny_scene):
+    """What begins with surfaces has one, and would never come to another."""
+    config = OctreeConfig(
+        levels=[4], downscales=[2], stage_ends=[1.0], tiles=[16], prunes=[0], sh_degree=1, final_sh_degree=2
+    )
+    dataset = load_dataset(tiny_scene, "train")
+    given = low_density_octree(dataset, 4, 1)
+    tuner, again = (OctreeTrainer(dataset, (1, 1, 1), config, 0, given) for _ in range(2))
+    for _ in range(3):
+        tuner.step(0.5)
+    assert tuner.octree.sh_degree == 2 and tuner.octree.sh[:, :, 4:].any()
+    again.load_state_dict(tuner.state_dict())
+    assert np.array_equal(again.octree.values, tuner.octree.values)
 
 
 def test_the_last_stage_has_more_bands(tiny_scene):

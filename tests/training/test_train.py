@@ -8,15 +8,17 @@ import weakref
 import numpy as np
 import pytest
 
+from nerfvol.config.assemble import read_yaml, write_yaml
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.training import prepare, session, train
+from nerfvol.training.clock import Clock
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.prepare import claim_folder
 from nerfvol.views import OctreeModel
 from tests.fixtures.real import real_data
-from tests.fixtures.runs import TINY, Pretended, log_of, run_of, settings, start
+from tests.fixtures.runs import TINY, Pretended, log_of, metrics_of, run_of, settings, start
 from tests.fixtures.tiny import write_scene
 
 
@@ -73,6 +75,21 @@ def test_a_resumed_run_keeps_its_settings(tmp_path, tiny_scene, command):
     assert (tmp_path / run_folder.CONFIG).read_text() == before
 
 
+def test_a_run_of_another_version_is_resumed(tmp_path, tiny_scene, command):
+    """Whose settings had one fewer, and one by another name: what is not stated is as where nobody chose it."""
+    claim_folder(settings(tiny_scene, tmp_path, octree={"tv_density": 1e-3}))
+    written = read_yaml(tmp_path / run_folder.CONFIG)
+    del written["octree"]["two_backgrounds"]
+    written["octree"]["smooth_density"] = written["octree"].pop("tv_density")
+    write_yaml(tmp_path / run_folder.CONFIG, written)
+    save_checkpoint(tmp_path / run_folder.CHECKPOINT, {"phase": "done", "steps": 3})
+    code, out, err = command("train", "--resume", "--out", tmp_path)
+    assert code == 0 and "is finished (3 steps)" in out + err
+    for change, said in (("two_backgrounds=true", "two_backgrounds = None"), ("tv_density=1e-4", "tv_density = 0.001")):
+        code, _, err = command("train", "--resume", "--out", tmp_path, "--set", f"octree.{change}")
+        assert code == 2 and f"octree.{said}, which cannot become" in err
+
+
 @pytest.mark.parametrize("state", [
     {}, {"phase": "octree"}, {"phase": "lunch", "steps": 3}, {"phase": "done"},
     {"phase": "octree", "trainer": {"values": np.zeros(3)}}, {"phase": ["octree"]}, {"phase": "octree", "trainer": 3},
@@ -96,7 +113,11 @@ def test_a_scene_of_nothing_is_said_at_once(tmp_path):
         write_png(path, np.ones((24, 24, 3)))
     with pytest.raises(InputError, match="the training images are empty.*--background"):
         start(settings(scene, tmp_path / "run"))
-    assert run_of(settings(scene, tmp_path, background="black")).data.training
+    data = run_of(settings(scene, tmp_path, background="black")).data.training
+    clear = dataclasses.replace(data, images=[np.zeros((24, 24, 4), np.uint8)] * len(data))
+    for colour in np.arange(256) / 510:  # 127.5 is no level, whichever way it is rounded
+        with pytest.raises(InputError, match="the training images are empty"):
+            prepare.require_something(clear, (colour, colour, colour))
 
 
 @pytest.mark.parametrize("init, section, more", [
@@ -108,6 +129,20 @@ def test_a_collapse_is_said_early(tmp_path, tiny_scene, init, section, more):
     with pytest.raises(InputError, match="collapsed to empty space.*--background.*or "):
         start(config)
     assert [line["progress"] for line in log_of(tmp_path) if line["progress"] > 0.2] == []
+
+
+def test_a_field_that_nobody_asked_for_may_come_out_empty(tmp_path, tiny_scene, compiled):
+    """Low density takes its place; a run resumed from there knows it, and that of one whose field became an octree."""
+    shape = {**TINY["field"]["shape"], "density_bias": -60}
+    config = settings(tiny_scene, tmp_path, field={**TINY["field"], "few_views": 100, "steps": 1000, "shape": shape})
+    said = []
+    start(config, say=said.append)
+    assert sum("start: low density, for the field came out empty" in sentence for sentence in said) == 1
+    metrics = metrics_of(tmp_path)
+    assert metrics["init"] == "auto" and metrics["steps"]["octree"] == 60 and not metrics["results"]
+    for results, init in (({}, "auto"), ({"distilled": {}}, "mlp")):
+        saved = {"phase": "octree", "log_bytes": 0, "results": results, "steps": {"field": 32, "octree": 1}}
+        assert session.Run(config, prepare.load_data(config), Clock(0.0, 0.0), saved).config.init == init
 
 
 @pytest.mark.parametrize("error", ["nan", "inf"])
