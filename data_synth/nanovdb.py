@@ -80,26 +80,31 @@ def contents(path: str | os.PathLike) -> Contents:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     held: dict[str, Stored] = {}
     others: list[str] = []
-    while r.at < len(r.data):
-        if r.take(8) not in MAGIC:
-            raise r.fail("the first bytes are another format's")
-        version, count, codec = r.number("I"), r.number("H"), r.number("H")
-        if version >> 21 != MAJOR:
-            raise r.fail(f"its layout is version {version >> 21}, not {MAJOR}: nanovdb_convert makes a .vdb of it")
-        if codec >= len(CODECS):
-            raise r.fail(f"its codec is number {codec}")
-        listed = [_listed(r, codec) for _ in range(count)]
-        for one, kind in listed:
-            one = one._replace(at=r.at)
-            try:
+    try:
+        while r.at < len(r.data):
+            for one, kind in _segment(r):
+                one = one._replace(at=r.at)
                 r.take(one.stored)
-            except InputError as error:
-                return Contents(r, held, others, error)
-            if one.channels:
-                held[unused(one.name, held)] = one
-            else:
-                others.append(f"{one.name} ({kind})")
+                if one.channels:
+                    held[unused(one.name, held)] = one
+                else:
+                    others.append(f"{one.name} ({kind})")
+    except InputError as error:  # where the next one begins is not known
+        return Contents(r, held, others, error)
     return Contents(r, held, others)
+
+
+def _segment(r: Reader) -> list[tuple[Stored, str]]:
+    """What the head of a segment lists; its grids' bytes come next, one after the other."""
+    where = "the first bytes" if r.at == 0 else "the bytes where its next segment begins"
+    if r.take(8) not in MAGIC:
+        raise r.fail(f"{where} are another format's")
+    version, count, codec = r.number("I"), r.number("H"), r.number("H")
+    if version >> 21 != MAJOR:
+        raise r.fail(f"its layout is version {version >> 21}, not {MAJOR}: nanovdb_convert makes a .vdb of it")
+    if codec >= len(CODECS):
+        raise r.fail(f"its codec is number {codec}")
+    return [_listed(r, codec) for _ in range(count)]
 
 
 def _listed(r: Reader, codec: int) -> tuple[Stored, str]:

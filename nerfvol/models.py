@@ -100,10 +100,9 @@ def describe_file(target: str | os.PathLike[str]) -> dict[str, Any]:
     """The JSON document in a model's file; of other programs' files the format alone."""
     named = model_path(target)
     if held := NOT_READ.get(named.suffix.lower()):
-        raise InputError(
-            f"{named} holds {held}, which nerfvol does not read: export it as .ply, as SuperSplat or "
-            f"'splat-transform {named.name} {named.stem}.ply' do"
-        )
+        others = f"SuperSplat or 'splat-transform {named.name} {named.stem}.ply' do"
+        by = "the program that made it may" if named.suffix.lower() == ".splatv" else others
+        raise InputError(f"{named} holds {held}, which nerfvol does not read: export it as .ply, as {by}")
     if named.suffix.lower() in SUFFIXES:
         return {"format": named.suffix.lower()}
     with model_file(named) as path:

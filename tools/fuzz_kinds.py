@@ -26,6 +26,7 @@ from nerfvol.splats.io import save_splats
 from nerfvol.splats.splats import Splats
 from nerfvol.training.saved import read_saved
 from tests.fixtures import scenes
+from tests.splats.written import compressed, unit_chunk
 
 ODD: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2**31, 2**63, 10**400, -(10**400), 0.5, 1e-320, 1e308, -1e308, float("nan"), float("inf"), "",
@@ -162,6 +163,16 @@ def targets(folder: Path) -> list[tuple[str, Callable[[random.Random], None], Ca
         path = folder / f"splats_{len(found)}.safetensors"
         save_splats(path, splats, {"near": 0.01, "orbit": orbit})
         add(f"splats {how.__name__}", how(path), lambda path=path: draw(path))
+    rng = np.random.default_rng(0)
+    path = folder / "packed.ply"
+    compressed(path, [unit_chunk()], rng.integers(0, 1 << 32, (9, 4)).tolist(), rng.integers(0, 256, (9, 9)).tolist())
+    add("packed ply", of_bytes(path), lambda path=path: draw(path))
+    path = folder / "rows.splat"
+    row = [("means", "<f4", 3), ("scales", "<f4", 3), ("rest", "u1", 8)]
+    rows = np.zeros(9, row)
+    rows["means"], rows["scales"], rows["rest"] = normal(9, 3), np.exp(normal(9, 3) - 3), rng.integers(0, 256, (9, 8))
+    path.write_bytes(rows.tobytes())
+    add("splat rows", of_bytes(path), lambda path=path: draw(path))
     for how in (of_header, of_bytes):
         path = folder / f"checkpoint_{len(found)}.safetensors"
         state = {"phase": "octree", "elapsed": 1.0, "phase_started": 0.5, "running": 0.1, "log_bytes": 0, "results": {},

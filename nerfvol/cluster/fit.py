@@ -38,7 +38,9 @@ class Fit(WorkerPlugin):
         except Exception as error:  # whatever is wrong over there, its name says more than silence
             reason = f"{type(error).__name__}: {error}"
         if reason:
-            worker.log_event(TOPIC, {"resource": self.resource, "worker": worker.address, "reason": reason})
+            # Waited for, as the resource is: whoever sees that this worker answered sees what it said.
+            event = {"resource": self.resource, "worker": worker.address, "reason": reason}
+            await worker.scheduler.log_event(topic=TOPIC, msg=event)
         else:
             await worker.set_resources(**{self.resource: 1})
 
@@ -78,14 +80,13 @@ def welcome(client: Client, needs: Needs) -> tuple[str, list[str]]:
             strangers = _strangers(client)
             break
     while True:
+        is_over = time.monotonic() > deadline  # before it is looked: what came in time is seen
         workers = client.scheduler_info(n_workers=-1)["workers"]
         fit = [address for address, worker in workers.items() if worker["resources"].get(plugin.resource)]
         refused = strangers | _refused(client, plugin.resource, workers)
-        if fit and len(fit) + len(refused) >= len(workers):
+        if fit and (is_over or len(fit) + len(refused) >= len(workers)):
             return plugin.resource, [f"{address} does not work on this: {why}" for address, why in refused.items()]
-        if time.monotonic() > deadline:
-            if fit:
-                return plugin.resource, []
+        if is_over:
             reasons = "; ".join(f"{address}: {why}" for address, why in refused.items()) or "there is no worker"
             raise InputError(f"--cluster: no worker is fit after {patience:.0f} s ({reasons})")
         time.sleep(0.05)

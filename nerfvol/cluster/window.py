@@ -30,6 +30,8 @@ TASKS_A_WORKER = 3
 TASK_SECONDS, LAST_SECONDS = 0.8, 0.1
 """A task takes at least about this long, so that its 5-10 ms of scheduling do not count; the last ones less, so that all
 workers end at one time."""
+MOST_BETWEEN_LOOKS = 3.0
+"""Seconds: what is more between two looks for workers is no waiting for them."""
 PATIENCE_FACTOR, LEAST_PATIENCE = 5.0, 10.0
 ATTEMPTS = 5
 
@@ -49,8 +51,8 @@ class _Task:
 class Window:
     """Runs a job on a client's workers. ``messages``: sentences on workers that take no part.
 
-    patience: seconds without anybody who is fit after which it is given up. repeat_late: items that take five times as long as
-    others are given out once more; not where two may not write one folder.
+    patience: seconds of looking, without anybody who is fit, after which it is given up. repeat_late: items that take five
+    times as long as others are given out once more; not where two may not write one folder.
     """
 
     def __init__(self, client: Client, job: Job, needs: Needs, repeat_late: bool = True) -> None:
@@ -61,9 +63,9 @@ class Window:
         self._fit: list[str] = []
         self._known: set[str] = set()
         self._look = math.inf
-        self.patience, self._seen = needs.patience, time.monotonic()
+        self.patience, self._alone = needs.patience, 0.0
         self._silent: set[str] = set()
-        self._asked = -1e9
+        self._asked = -math.inf
         self._tasks: dict[Fetch[Any], _Task] = {}
 
     def results(self, items: Sequence[Any], ahead: Ahead | None = None) -> Generator[Any]:
@@ -101,15 +103,16 @@ class Window:
 
     def _workers(self) -> list[str]:
         """Addresses that may take tasks, asked of the scheduler once a second; without the silent ones, if others are left."""
-        if time.monotonic() - self._asked > 1.0:
+        now = time.monotonic()
+        if now - self._asked > 1.0:
             try:
                 self._fit = fit_workers(self.client, self.resource)
             except (KeyError, OSError, ValueError) as error:
                 raise self._gone() from error
+            # While this process was stopped, or nobody asked for results, nobody waited.
+            self._alone = 0.0 if self._fit else self._alone + min(now - self._asked, MOST_BETWEEN_LOOKS)
             self._asked = time.monotonic()
-            if self._fit:
-                self._seen = self._asked
-            elif self._asked - self._seen > self.patience:
+            if self._alone > self.patience:
                 raise InputError(
                     f"--cluster: no worker has been fit for {self.patience:.0f} s; what was written stays, and the same "
                     "command goes on from there"
@@ -145,11 +148,13 @@ class Window:
             )  # fmt: skip
         except Exception as error:
             raise self._gone() from error
-        # Each result is fetched for itself: one that lies on a frozen worker does not hold up the others.
+        self._tasks[self._fetch(future)] = _Task(first, last, future, time.monotonic(), attempts)
+
+    def _fetch(self, future: Future) -> Fetch[Any]:
+        """Each result is fetched for itself: one that lies on a frozen worker does not hold up the others."""
         loop = cast(Any, self.client.loop).asyncio_loop
         gathering = cast(Coroutine[Any, Any, Any], self.client.gather([future], asynchronous=True))
-        fetch = asyncio.run_coroutine_threadsafe(gathering, loop)
-        self._tasks[fetch] = _Task(first, last, future, time.monotonic(), attempts)
+        return asyncio.run_coroutine_threadsafe(gathering, loop)
 
     def _finished(self, items: Sequence[Any]) -> Iterator[tuple[int, Done]]:
         """Waits a moment for tasks; what they gave, by the first item. What could not run is given out again."""
@@ -160,7 +165,11 @@ class Window:
             task = self._tasks.pop(fetch, None)
             if task is None:  # another try of the same items came first
                 continue
-            error = fetch.exception()
+            if fetch.cancelled() and task.future is not None and task.future.status != "cancelled":
+                # The engine fetches together what is asked for at one time: it was given up with another that was released.
+                self._tasks[self._fetch(task.future)] = task
+                continue
+            error = asyncio.CancelledError() if fetch.cancelled() else fetch.exception()
             if error is not None:
                 self._failed(items, task, error)
                 continue

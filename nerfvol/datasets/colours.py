@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from nerfvol.datasets.primaries import UNSPECIFIED, Matrix, code_points, is_srgb, named, to_srgb
+from nerfvol.datasets.primaries import SRGB, UNSPECIFIED, Matrix, code_points, is_srgb, named, to_srgb
 
 SAME = 2
 """Levels of 255 by which a profile's colours may differ from sRGB's and still be those: profiles are rounded."""
@@ -91,7 +91,7 @@ def _of_numbers(gamma: Any, places: Any) -> Colours | None:
         name, known = f"a gamma of {gamma:.3g}", 1 / gamma
         if not _GAMMAS[0] <= gamma <= _GAMMAS[1]:
             return Colours(name)
-    if not isinstance(places, tuple) or is_srgb(places):
+    if not isinstance(places, tuple) or len(places) != len(SRGB) or is_srgb(places):  # some decoders hand on any number
         return Colours(name, gamma=known) if name else None
     red = f"{places[2]:.3g} {places[3]:.3g}"
     name = f"{name} and " * bool(name) + f"primaries of their own (red at {red}, by cHRM)"

@@ -131,12 +131,13 @@ class ImageHeader:
 def image_header(path: Path) -> ImageHeader:
     """What the file's header says, without decoding; InputError where it is no image, damaged or too large."""
     with _opened(path) as image:
+        colours = colours_of(image)  # first: looking for EXIF may decode the picture, which closes the file
         orientation = _exif(image, path).get(_EXIF_ORIENTATION, 1)
         known = type(orientation) is int and 1 <= orientation <= 8
         # What phones write behind a photograph, MPO, is a map of its brightness. Others are not counted: that would read
         # them, with all that is wrong with them, and leave what they state in image.info.
         several = image.format != "MPO" and getattr(image, "is_animated", False)
-        return ImageHeader(image.size, orientation if known else 1, colours_of(image), several)
+        return ImageHeader(image.size, orientation if known else 1, colours, several)
 
 
 def _exif(image: Image.Image, path: Path) -> Image.Exif:

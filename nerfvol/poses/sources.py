@@ -150,6 +150,7 @@ def _copy(path: Path, folder: Path, name: str, size: int) -> Photograph:
     with Image.open(path, formats=formats_for(path)) as image:
         if image.width * image.height > MAX_PIXELS:
             raise ValueError(f"{image.width}x{image.height} pixels are more than {MAX_PIXELS:,}")
+        colours = colours_of(image)  # first: looking for EXIF may decode the picture, which closes the file
         exif = image.getexif()
         turned = exif.get(_ORIENTATION, 1) in range(2, 9)
         camera, focal_35 = _camera_of(exif)
@@ -165,8 +166,7 @@ def _copy(path: Path, folder: Path, name: str, size: int) -> Photograph:
             if not target.exists() or target.stat().st_size != path.stat().st_size:
                 with atomic_write(target) as temporary:
                     shutil.copyfile(path, temporary)
-        else:
-            colours = colours_of(image)  # the copy has no profile: in it are sRGB's
+        else:  # the copy has no profile: in it are sRGB's
             image.draft(None, (2 * width, 2 * height))
             upright = ImageOps.exif_transpose(image)
             upright = (upright if colours is None else colours.to_srgb(upright)).convert("RGB")

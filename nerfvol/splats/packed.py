@@ -5,7 +5,8 @@ colours (min_x .. max_z, min_scale_x .. max_scale_z, min_r .. max_b). Element "v
 packed_position and packed_scale 11, 10 and 11 bits between the chunk's ends; packed_rotation the number (2 bits) of the
 quaternion's largest entry, w first, which is positive, then the other three in turn, 10 bits from -1/sqrt(2) to 1/sqrt(2);
 packed_color 8 bits each of red, green, blue between the chunk's ends (older: 0 and 1) and opacity. Element "sh", where
-there are harmonics: f_rest_0 .. as bytes, 256 equal parts of -4 to 4.
+there are harmonics: f_rest_0 .. as bytes, the middle of each of 256 equal parts of -4 to 4, but of the first and the last their
+outer ends, for there is also what was beyond.
 """
 
 from __future__ import annotations
@@ -113,4 +114,6 @@ def _harmonics(file: PlyFile) -> NDArray[np.float32]:
     _expect(file, "sh", names, "u1")
     table = file.read("sh")
     codes = np.stack([table[name] for name in names], axis=1).reshape(file.count, 3, number // 3)
-    return (((codes + 0.5) / 256 - 0.5) * (2 * LARGEST_HARMONIC)).astype(np.float32)
+    middles = (np.arange(256) + 0.5) / 256
+    middles[[0, 255]] = 0, 1
+    return ((middles - 0.5) * (2 * LARGEST_HARMONIC)).astype(np.float32)[codes]

@@ -3,12 +3,14 @@
 The engine is real (two processes of this machine); one of them serves all tests but those that end it.
 """
 
+import asyncio
 import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,7 @@ from nerfvol.cluster.needs import Needs, fingerprint, with_data
 from nerfvol.cluster.tasks import Job
 from nerfvol.cluster.window import Window
 from nerfvol.errors import InputError
+from tests.cluster.clock import Steps
 from tests.cluster.work import keep_files_in
 
 ROOT = Path(__file__).parents[2]
@@ -99,6 +102,37 @@ def patient_engine(client):
     client.run_on_scheduler(wait_for, seconds=before)
 
 
+def test_a_fetch_that_was_given_up_with_another_is_begun_again(client, monkeypatch):
+    """The engine fetches together what is asked for at one time, and who releases one of these ends all."""
+    gather, calls = client.gather, []
+
+    async def given_up():
+        raise asyncio.CancelledError
+
+    def gathered(futures, **options):
+        calls.append(None)
+        return given_up() if len(calls) in (2, 3, 5) else gather(futures, **options)
+
+    monkeypatch.setattr(client, "gather", gathered)
+    results = list(Window(client, job("double", seconds=0.05), Needs()).results(range(12)))
+    assert [value for value, _ in results] == [2 * k for k in range(12)] and len(calls) > 5
+
+
+def test_time_in_which_nobody_looked_is_no_waiting_for_workers(client, monkeypatch):
+    """As after a process was stopped, or its reader was busy: whoever was given up meanwhile comes back."""
+    results = Window(client, job("double"), Needs()).results(range(40))
+    found, looks, real = [next(results)], [], window.fit_workers
+
+    def fit_workers(*given):
+        looks.append(None)
+        return [] if len(looks) < 2 else real(*given)
+
+    monkeypatch.setattr(window, "fit_workers", fit_workers)
+    later = types.SimpleNamespace(**{**vars(time), "monotonic": lambda: time.monotonic() + 1000})
+    monkeypatch.setattr(window, "time", later)
+    assert [value for value, _ in [*found, *results]] == [2 * k for k in range(40)] and looks
+
+
 def test_a_frozen_worker_holds_nothing_up(client, monkeypatch, patient_engine):
     """Its work is done while it still belongs to the engine."""
     monkeypatch.setattr(window, "LEAST_PATIENCE", 0.5)
@@ -145,11 +179,42 @@ def test_what_fails_everywhere_is_one_sentence(client):
         list(Window(client, job("broken"), Needs()).results(range(4)))
 
 
-def test_workers_that_draw_otherwise_are_named(client):
+def test_workers_that_draw_otherwise_are_named(client, monkeypatch):
+    """Once each has answered, however long that takes."""
+    monkeypatch.setattr(fit, "time", Steps())
     with pytest.raises(InputError) as caught:
         fit.welcome(client, Needs(probes=("tests.cluster.work:other_probe",), patience=2.0))
     assert all(address in str(caught.value) for address in workers(client))
     assert "draws other pictures" in str(caught.value)
+
+
+def test_who_is_not_fit_has_said_so_when_it_answers():
+    """What is sent otherwise may come later than the answer, and after patience is over."""
+    said = []
+
+    class Scheduler:
+        async def log_event(self, topic, msg):
+            said.append((topic, msg["worker"], msg["reason"]))
+
+    worker = types.SimpleNamespace(address="tcp://one", scheduler=Scheduler(), log_event=lambda *given: None)
+    asyncio.run(Fit(Needs(room=10**18), fingerprint(Needs())).setup(worker))  # pyright: ignore[reportArgumentType]
+    ((topic, address, reason),) = said
+    assert topic == fit.TOPIC and address == "tcp://one" and "are needed" in reason
+
+
+def test_who_is_silent_takes_nothing_from_what_others_said(client, monkeypatch):
+    """Of three workers one is fit, one says why not, and the last never answers."""
+    registered, refused = [], {"worker": "tcp://two", "reason": "why"}
+    workers = dict.fromkeys(("tcp://two", "tcp://three"), {"resources": {}})
+
+    def info(n_workers):
+        return {"workers": {**workers, "tcp://one": {"resources": {registered[0].resource: 1}}}}
+
+    monkeypatch.setattr(fit, "time", Steps())
+    monkeypatch.setattr(client, "register_plugin", registered.append)
+    monkeypatch.setattr(client, "scheduler_info", info)
+    monkeypatch.setattr(client, "get_events", lambda topic: [(0.0, {**refused, "resource": registered[0].resource})])
+    assert fit.welcome(client, Needs())[1] == ["tcp://two does not work on this: why"]
 
 
 def test_fit_asks_for_kernels_data_and_room(tmp_path, monkeypatch):

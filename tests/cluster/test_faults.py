@@ -26,6 +26,7 @@ from nerfvol.errors import InputError
 from nerfvol.film import Chosen, Film, write_pictures
 from nerfvol.models import load_model
 from nerfvol.octree.io import save_octree
+from tests.cluster.clock import Steps
 from tests.cluster.work import die_once_in, keep_files_in
 
 ROOT = Path(__file__).parents[2]
@@ -185,6 +186,7 @@ def test_workers_of_another_instruction_set_are_refused_by_name(model, expected,
 
     if ops.isa() not in ("avx2", "avx512"):
         pytest.skip(f"these kernels are {ops.isa()}: there is nothing to tell them from")
+    monkeypatch.setattr(fit, "time", Steps())
     with scheduler_of(tmp_path) as (file, worker), connect(file) as found:
         worker(NERFVOL_ISA="baseline")
         found.wait_for_workers(1, timeout=600)
@@ -223,7 +225,7 @@ def test_a_worker_without_nerfvol_is_named_and_the_others_work(tmp_path):
             fit.welcome(found, Needs(patience=2.0))
         worker()
         found.wait_for_workers(2, timeout=600)
-        window = Window(found, Job("tests.cluster.work:double", {}), Needs())
+        window = Window(found, Job("tests.cluster.work:double", {}), Needs(patience=600.0))
         assert [
             said for said in window.messages if said.startswith(f"{stranger} does not work on this: nerfvol cannot")
         ]

@@ -140,6 +140,60 @@ def nodes(uppers, lowers=0, leaves=0, layout=1):
     return b"NanoVDB0" + struct.pack("<IHH", 32 << 21, 1, 0) + bytes(meta) + b"d\0" + bytes(data)
 
 
+def named(name, value, **more):
+    """A segment with a fog of one value."""
+    data = bytearray(nodes(1, **more))
+    at = data.index(b"NanoVDB1") - 2  # the name, "d" and its end
+    table = at + 2 + 672 + 64 + 64 + 32 + 8256
+    data[table : table + 8] = struct.pack("<ff", value, 0)
+    active = at + 2 + 672 + 64 + 64 + 32 + 32
+    data[active : active + 4096] = b"\1" + bytes(4095)
+    struct.pack_into("<I", data, 16 + 136, len(name) + 1)
+    return bytes(data[:at]) + name.encode() + b"\0" + bytes(data[at + 2 :])
+
+
+@pytest.mark.parametrize("names, known", [
+    (("density", "density", "heat"), {"density": 1, "density[0]": 1, "density[1]": 2, "heat": 3}),
+    (("", ""), {"[0]": 1, "[1]": 2}), (("", "heat"), {"[0]": 1, "heat": 2}),
+    (("a", "a", "a[1]"), {"a": 1, "a[0]": 1, "a[1]": 2, "a[1][1]": 3}),
+])  # fmt: skip
+def test_several_grids_of_one_name_and_grids_without_one(tmp_path, names, known):
+    """As of OpenVDB's files."""
+    path = tmp_path / "a.nvdb"
+    path.write_bytes(b"".join(named(name, k + 1.0) for k, name in enumerate(names)))
+    for name, value in known.items():
+        assert read_vdb(path, name).values.max() == value, name
+    shown = known.keys() - {f"{name}[0]" for name in known}
+    assert grid_names(path) == (dict.fromkeys((n for n in known if n in shown), 1), ())
+
+
+@pytest.mark.parametrize("what, message", [
+    ("cut", "ends too early"), ("cut head", "ends too early"), ("size", "says it has 1099511627776 bytes"),
+    ("magic", "the bytes where its next segment begins are another"), ("begin", "the grid heat does not begin as one"),
+])  # fmt: skip
+def test_a_damaged_grid_is_no_harm_to_those_before_it(tmp_path, what, message):
+    """Whoever names none gets the density where that is whole; else nobody knows which was meant."""
+    path = tmp_path / "a.nvdb"
+    whole, heat = [named("first", 1.0), named("density", 2.0)], bytearray(named("heat", 3.0))
+    if what.startswith("cut"):
+        del heat[60 if what == "cut head" else len(heat) // 2 :]
+    elif what == "begin":
+        heat[heat.index(b"NanoVDB1") + 7] = 7
+    else:
+        struct.pack_into("<Q", heat, 16 if what == "size" else 0, 1 << 40)
+    path.write_bytes(b"".join(whole) + heat)
+    assert read_vdb(path, "first").values.max() == 1 and read_vdb(path).values.max() == 2
+    with pytest.raises(InputError, match=message) as caught:
+        read_vdb(path, "heat")
+    assert "a.nvdb" in str(caught.value) and "\n" not in str(caught.value)
+    path.write_bytes(whole[0] + heat)
+    if what == "begin":
+        assert read_vdb(path).values.max() == 1
+    else:
+        with pytest.raises(InputError, match=message):
+            read_vdb(path)
+
+
 @pytest.mark.parametrize("given, message", [
     ((3,), "more nodes than there is room for"), ((1, 40), "more nodes than there is room for"),
     ((1, 1, 4096), "more leaves than there is room for"), ((70_000,), "says it has 70000 places"),

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms, PngImagePlugin, TiffImagePlugin
 
-from nerfvol.datasets.colours import colours_of
+from nerfvol.datasets.colours import _of_numbers, colours_of
 from nerfvol.datasets.images import image_header, read_image, read_mask
 from nerfvol.datasets.load import load_dataset
+from nerfvol.datasets.primaries import BY_CODE, to_srgb
 from nerfvol.errors import InputError
 from tests.datasets.test_whatever_people_bring import said, scene
 from tests.fixtures import scenes
@@ -171,6 +172,31 @@ def test_code_points_without_a_known_conversion_are_told(tmp_path, codes, words)
     with Image.open(path) as image:
         colours = colours_of(image)
     assert colours is not None and not colours.is_known and words in colours.name
+
+
+def test_code_points_of_a_png_with_something_behind_its_pixels(tmp_path):
+    """As ImageMagick writes its dates: a decoder looks there for EXIF, and closes the file."""
+    path = save(tmp_path / "a.png", pnginfo=chunks((b"cICP", bytes((12, 13, 0, 1)))))
+    data, text = path.read_bytes(), b"tEXtdate:create\x002026-12-01"
+    chunk = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    path.write_bytes(data[:-12] + chunk + data[-12:])
+    colours = image_header(path).colours
+    assert colours is not None and colours.name == "Display P3, by cICP"
+
+
+def test_primaries_of_which_a_decoder_hands_on_another_number_are_none():
+    assert _of_numbers(None, (0.3127, 0.329)) is None and _of_numbers(None, ()) is None
+
+
+@pytest.mark.parametrize("code, published", [
+    (12, [[1.2249402, -0.2249402, 0], [-0.0420570, 1.0420570, 0], [-0.0196376, -0.0786361, 1.0982736]]),
+    (9, [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]]),
+])  # fmt: skip
+def test_matrices_are_those_that_are_published(code, published):
+    """CSS Color 4's for Display P3, ITU-R BT.2087's for BT.2020, which has four digits."""
+    np.testing.assert_allclose(
+        np.array(to_srgb(BY_CODE[code][1])), published, rtol=0, atol=6e-8 if code == 12 else 6e-5
+    )
 
 
 def test_code_points_that_say_nothing_leave_it_to_the_rest(tmp_path):

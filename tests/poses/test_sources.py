@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from nerfvol.datasets.images import read_image
 from nerfvol.errors import InputError
@@ -71,6 +71,16 @@ def test_copies_have_the_colours_that_the_photograph_states(tmp_path, turn):
         step = along.shape[1] / 6
         found = along[along.shape[0] // 2, [int(step * (k + 0.5)) for k in range(6)]]
         assert np.abs(found - srgb_of(COLOURS, P3, 2.2)[0]).max() <= 8
+
+
+def test_copies_have_the_colours_of_a_pngs_code_points(tmp_path):
+    """A PNG without EXIF is decoded to look for it behind the pixels, which closes the file."""
+    info = PngImagePlugin.PngInfo()
+    info.add(b"cICP", bytes((12, 13, 0, 1)))
+    Image.new("RGB", (64, 64), (200, 100, 50)).save(tmp_path / "a.png", pnginfo=info)
+    copy_photographs([tmp_path / "a.png"], tmp_path / "out", 32)
+    copy = read_image(tmp_path / "out/a.jpg")
+    assert np.abs(copy.astype(int) - read_image(tmp_path / "a.png")[:32, :32]).max() <= 3
 
 
 def test_photographs_reach_no_other_decoders(tmp_path, monkeypatch):

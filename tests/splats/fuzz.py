@@ -24,6 +24,7 @@ from nerfvol.splats.ply import save_ply
 from nerfvol.splats.plyfile import write_ply
 from nerfvol.splats.spz import save_spz
 from tests.splats.scenes import random_splats
+from tests.splats.written import compressed, unit_chunk
 
 MOST_BYTES = 64 << 20
 """Of Python's and numpy's memory, for files of some kilobytes."""
@@ -81,6 +82,12 @@ def sources(folder: Path) -> dict[str, tuple[str, bytes, Callable[[bytes], bytes
         "points.ply": written(".ply", lambda path: write_ply(path, [], points)),
         "text.ply": (".ply", text + b"property uchar red\nend_header\n" + rows, as_it_is),
     }
+    compressed(folder / "packed.ply", [unit_chunk()], rng.integers(0, 1 << 32, (40, 4)).tolist(),
+               rng.integers(0, 256, (40, 9)).tolist())  # fmt: skip
+    out["packed.ply"] = (".ply", (folder / "packed.ply").read_bytes(), as_it_is)
+    out["rows.splat"] = (".splat", b"".join(
+        struct.pack("<6f8B", *rng.normal(size=3), *rng.uniform(0, 1, 3), *rng.integers(0, 256, 8)) for _ in range(40)
+    ), as_it_is)  # fmt: skip
     if not importlib.util.find_spec("gsply"):
         return out
     out["3.spz"] = written(".spz", lambda path: save_spz(path, splats, 3))

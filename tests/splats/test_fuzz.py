@@ -1,4 +1,4 @@
-"""Damaged .ply and .spz files are refused in one sentence or read, and never cost more than they hold."""
+"""Damaged .ply, .splat and .spz files are refused in one sentence or read, and never cost more than they hold."""
 
 import gzip
 import struct
@@ -13,7 +13,9 @@ from tests.splats.scenes import random_splats
 HEADER = struct.Struct("<4sIIBBBB")
 
 
-@pytest.mark.parametrize("name", ["splats.ply", "points.ply", "text.ply", "3.spz", "4.spz", "inside.spz"])
+@pytest.mark.parametrize("name", [
+    "splats.ply", "points.ply", "text.ply", "packed.ply", "rows.splat", "3.spz", "4.spz", "inside.spz",
+])  # fmt: skip
 def test_any_damage_is_a_sentence_or_a_model(tmp_path, name):
     if name.endswith(".spz"):
         pytest.importorskip("gsply")
