@@ -39,13 +39,14 @@ BEHIND = 1.5
 """Cells by which a point may lie behind the first on its ray and still have its colour."""
 
 
-def has_silhouettes(dataset: Dataset) -> bool:
-    """Whether it is an object whose pictures are cut out: what a hull is carved with. An opaque alpha cuts nothing out, and
-    what it would leave is the box."""
+def has_silhouettes(dataset: Dataset, all_of_them: bool = False) -> bool:
+    """Whether it is an object whose pictures are cut out, or ``all_of_them`` are: what a hull is carved with. An opaque alpha
+    cuts nothing out, and what it would leave is the box."""
     if dataset.scene.is_unbounded or dataset.masks is not None or any(i.shape[2] != 4 for i in dataset.images):
         return False
-    looked = dataset.evenly(VIEWS).images
-    return sum(bool((image[::4, ::4, 3] < OPAQUE).any()) for image in looked) >= CUT_OUT * len(looked)
+    looked = dataset.images if all_of_them else dataset.evenly(VIEWS).images
+    cut_out = sum(bool((image[::4, ::4, 3] < OPAQUE).any()) for image in looked)
+    return cut_out >= (1.0 if all_of_them else CUT_OUT) * len(looked)
 
 
 def hull_points(dataset: Dataset, n: int = POINTS, seed: int = 0) -> PointCloud:

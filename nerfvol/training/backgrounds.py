@@ -21,8 +21,9 @@ def farthest(background: Sequence[float]) -> Colour:
 
 
 def second_background(dataset: Dataset, background: Sequence[float], wanted: bool) -> Colour | None:
-    """The second of the two colours; None: there is one alone, for a second is not wanted or the pictures are not cut out."""
-    return farthest(background) if wanted and has_silhouettes(dataset) else None
+    """The second of the two colours; None: there is one alone, for a second is not wanted or not all pictures are cut out: an
+    opaque one has its background painted in."""
+    return farthest(background) if wanted and has_silhouettes(dataset, all_of_them=True) else None
 
 
 def is_second(second: Colour | None, step: int) -> bool:

@@ -40,6 +40,11 @@ def test_the_second_is_the_farthest_colour(white_ball, given, other):
     assert second_background(white_ball, given, False) is None
     opaque = dataclasses.replace(white_ball, images=[i[..., :3] for i in white_ball.images])
     assert second_background(opaque, given, True) is None
+    painted = [np.dstack([i[..., :3], np.full_like(i[..., 3], 255)]) for i in white_ball.images[:1]]
+    assert (
+        second_background(dataclasses.replace(white_ball, images=[*painted, *white_ball.images[1:]]), given, True)
+        is None
+    )
 
 
 @pytest.mark.parametrize("two", [False, True])
