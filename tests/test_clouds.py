@@ -161,6 +161,6 @@ def test_no_gaussians_and_neither_kind_of_file(tmp_path, command):
         load_model(tmp_path / "g.ply")
     (tmp_path / "x.bin").write_bytes(b"something else entirely")
     code, _, err = command("info", tmp_path / "x.bin")
-    assert code == 2 and "its .safetensors file, a page, .ply, .spz, .npz" in err and err.count("\n") == 1
+    assert code == 2 and "its .safetensors file, a page, .ply, .spz, .splat, .npz" in err and err.count("\n") == 1
     (tmp_path / "x.spz").write_bytes(b"something else entirely")
     assert command("info", tmp_path / "x.spz")[0] == 2

@@ -149,6 +149,10 @@ class PlyFile:
         cannot hold."""
         have, need, at = self._size - self._rows_at + (self.format == "ascii"), 0, 0
         for other, element in self.elements.items():
+            if element.fault and element.count and other == name:
+                raise self.fault(
+                    f"its element {name!r} has a list, or a property that is twice there or of no known type"
+                )
             if element.fault and element.count:
                 before = "its vertices" if name == "vertex" else f"its element {name!r}"
                 raise self.fault(f"the element {other[:40]!r}, whose rows differ in length, comes before {before}")

@@ -12,7 +12,7 @@ from nerfvol.models import load_model
 from nerfvol.splats.ply import is_splat_ply, load_ply
 from nerfvol.splats.rows32 import load_splat
 from tests.splats.test_ply import columns_of, make_splats, same, write_table
-from tests.splats.written import WORDS, compressed, unit_chunk
+from tests.splats.written import ENDS, WORDS, compressed, unit_chunk
 
 
 @pytest.mark.parametrize("word, parts", [
@@ -136,6 +136,18 @@ def test_packed_files_that_end_early_or_lack_their_chunks(tmp_path):
     path.write_bytes(whole.replace(b"element chunk", b"element lumps"))
     with pytest.raises(InputError, match="no element 'chunk'"):
         load_ply(path)
+
+
+def test_a_packed_file_whose_chunks_have_a_list(tmp_path):
+    """Behind the vertices, where its rows need not be passed over."""
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    head += b"".join(b"property uint %s\n" % word.encode() for word in WORDS)
+    (tmp_path / "bad.ply").write_bytes(
+        head + b"element chunk 1\nproperty list uchar float more\n"
+        + b"".join(b"property float %s\n" % name.encode() for name in ENDS) + b"end_header\n" + bytes(200)
+    )  # fmt: skip
+    with pytest.raises(InputError, match="its element 'chunk' has a list"):
+        load_ply(tmp_path / "bad.ply")
 
 
 def test_elements_before_the_vertices_are_passed_over(tmp_path):
