@@ -178,8 +178,9 @@ class Config(Checked):
             start = "auto" if budget is not None and budget <= SHORT_RUN else "mlp"
         else:
             until = math.inf if scene.is_unbounded else max(SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL * side)
-            is_too_short = budget is None or (budget <= SHORT_RUN and not scene.is_unbounded)
-            start = "auto" if is_too_short or is_simulated else "splats" if budget <= until else "mlp"
+            start = "auto"
+            if budget is not None and not is_simulated and (scene.is_unbounded or budget > SHORT_RUN):
+                start = "splats" if budget <= until else "mlp"
         init = start if self.init == "auto" else self.init
         if not few:
             return dataclasses.replace(self, init=init)
