@@ -36,8 +36,8 @@ SPLATS_UNTIL, SPLATS_UNTIL_A_PIXEL = 60.0, 0.15
 pixel of the pictures' shorter side, whichever is later; longer runs begin with a field. Fog takes most of the time to become
 surfaces (lego 400x400, 1 minute: 33.4 dB from splats, 33.4 from a field, 33.2 from fog, 2 minutes: 34.3 and 34.7 from a field;
 800x800, 2 minutes: 33.6, 32.8, 32.3, 5 minutes: 35.0, 35.2, 34.7; docs/performance.md)."""
-LONG_RUN = 45.0
-"""Seconds of a time budget from which on a field that is the product has larger tables, ..."""
+LARGE_TABLES_FROM = 45.0
+"""Seconds of a time budget from which on a field that is the product has larger tables than one that becomes an octree, ..."""
 LARGE_TABLES: dict[str, Any] = {"hash_log2_table": 19, "hash_max": 512}
 """... these: a step takes 1.4 times as long, and they hold details that a longer run has the time to learn (lego 400x400:
 28.83 and 28.65 dB after 30 s, 29.49 and 29.63 after 60; docs/experiments.md)."""
@@ -201,7 +201,7 @@ class Config(Checked):
         if begun is not None:
             tables = {name: getattr(begun, name) for name in LARGE_TABLES}
         elif all(getattr(shape, name) is None for name in LARGE_TABLES):
-            is_long = budget is not None and budget >= LONG_RUN
+            is_long = budget is not None and budget >= LARGE_TABLES_FROM
             tables = LARGE_TABLES if is_long and n > self.field.few_views and not scene.is_unbounded else {}
         settled = filled(shape, tables).settled()
         return dataclasses.replace(self, field=dataclasses.replace(self.field, shape=settled))

@@ -38,7 +38,6 @@ from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import Schedule
 from nerfvol.training.surface_stages import (
     MOST_LEVEL,
-    finest_level,
     has_stages_of_its_own,
     stage_for,
     stage_in,
@@ -210,16 +209,11 @@ def start_from_splats(
     model = trainer.take_model({})
     del trainer
     started, cameras = time.perf_counter(), data.training.cameras
-    if plan.stage is not None:
-        level, factor = plan.stage
-        cameras = [camera.scaled(factor) for camera in cameras]
-    else:
-        level, factor = (
-            min(finest_level(scene, cameras) + scene.is_unbounded, MOST_LEVEL, max(config.octree.levels)),
-            None,
-        )
+    level, factor = plan.stage or (None, 1)
+    cameras = [camera.scaled(factor) for camera in cameras]
+    most_level = min(MOST_LEVEL, max(config.octree.levels))  # where no level is planned
     try:
-        octree = surfaces_of(model.splats, scene, cameras, background, level)
+        octree = surfaces_of(model.splats, scene, cameras, background, level, most_level)
     except InputError as error:
         if run.given.init != "auto":
             raise
@@ -234,7 +228,7 @@ def start_from_splats(
         run.results[name] = {"seconds": spent, "leaves": leaves, "MB": made.describe()["bytes_in_memory"] / 1e6,
                              **summary(evaluate(made, data.compared, background))}  # fmt: skip
     run.results["splats"]["steps"] = steps
-    if factor is not None:
+    if plan.stage is not None:
         run.results["converted"] |= {"level": level, "images": factor}
     return_free_memory()
     return octree

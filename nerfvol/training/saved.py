@@ -52,7 +52,9 @@ def field_begun(state: Mapping[str, Any], path: Path) -> FieldShape | None:
     """The shape of the field that a run with ``state`` in its checkpoint has begun; None: it has begun none, or with a version
     whose settings stated it all. InputError where the checkpoint at ``path`` states no shape there."""
     trainer = state.get("trainer") if state["phase"] == "field" else None
-    shape = trainer.get("shape") if isinstance(trainer, dict) else None  # what is damaged there is told once it is taken up
+    shape = (
+        trainer.get("shape") if isinstance(trainer, dict) else None
+    )  # what is damaged there is told once it is taken up
     if shape is None:
         return None
     if not isinstance(shape, dict):

@@ -12,7 +12,7 @@ from nerfvol.cameras.camera import Camera
 from nerfvol.config import field as config_field
 from nerfvol.config import training
 from nerfvol.config.field import FieldConfig, FieldShape
-from nerfvol.config.training import LONG_RUN
+from nerfvol.config.training import LARGE_TABLES_FROM
 from nerfvol.errors import InputError
 from nerfvol.files import run_folder
 from nerfvol.kernels.field_model import EARLY_STOP
@@ -193,8 +193,8 @@ UNSAID = {**TINY["field"], "shape": {"width": 16, "hash_levels": 4, "hash_min": 
 
 
 @pytest.mark.parametrize("budget, more, tables", [
-    (LONG_RUN, {}, (19, 512)), (LONG_RUN - 1, {}, (17, 256)), (None, {}, (17, 256)),
-    (LONG_RUN, {"hash_log2_table": 12}, (12, 256)), (LONG_RUN, {"hash_max": 64}, (17, 64)),
+    (LARGE_TABLES_FROM, {}, (19, 512)), (LARGE_TABLES_FROM - 1, {}, (17, 256)), (None, {}, (17, 256)),
+    (LARGE_TABLES_FROM, {"hash_log2_table": 12}, (12, 256)), (LARGE_TABLES_FROM, {"hash_max": 64}, (17, 64)),
 ])  # fmt: skip
 def test_long_runs_have_larger_tables(budget, more, tables, tmp_path, tiny_scene):
     """... where nobody chose their size; the estimate of memory follows. Not of few views, photographs, or octrees' fields."""
@@ -224,7 +224,7 @@ def test_a_resumed_run_keeps_the_tables_it_began_with(tmp_path, tiny_scene, monk
     def interrupt(run, phase, began_stage):
         run.interrupted = True
 
-    for first, then, tables in ((LONG_RUN, None, (12, 48)), (None, LONG_RUN, (9, 16))):
+    for first, then, tables in ((LARGE_TABLES_FROM, None, (12, 48)), (None, LARGE_TABLES_FROM, (9, 16))):
         field = {**UNSAID, "steps": 4}
         out, said = tmp_path / f"{first}", []
         config = settings(tiny_scene, out, representation="field", time_budget=first, field=field)
