@@ -84,13 +84,15 @@ def open_volume(path: str | os.PathLike, uses: Collection[str] = ("colour", "hea
     found = read_blocks(given)
     if found is None:
         return Volume(*read_volume(path))
-    volume = Volume(_checked(given, found.volume, found.voxel_size)[0], found.voxel_size)
+    volume = Volume(_checked(f"{given}:{found.name}", found.volume, found.voxel_size)[0], found.voxel_size)
     wanted = {"colour": [n for n in COLOUR if held.get(n) == 3][:1]}
     wanted["heat"] = [n for n in TEMPERATURE + FLAME if held.get(n) == 1][:1]
     taken = []
     for what, name in ((use, name) for use in uses for name in wanted[use]):
         try:
             other = read_blocks(given, name)
+            if other is not None:
+                _checked(f"{given}:{name}", other.volume, other.voxel_size)
         except InputError as error:
             said = f"{name} cannot be read and is left out: {error}"
             warnings.warn(f"{given}: {said}", RenderWarning, stacklevel=2)
@@ -101,7 +103,6 @@ def open_volume(path: str | os.PathLike, uses: Collection[str] = ("colour", "hea
             )
             continue
         moved = Sparse(other.volume.corner + other.first - found.first, other.volume.blocks, found.volume.size)
-        _checked(given, moved, found.voxel_size)
         taken.append(f"{name} as {what}")
         if what == "colour":
             volume.colour = moved.map(lambda v: np.clip(v, 0.0, 1.0))
@@ -156,7 +157,7 @@ def _read_grid(path: Path, name: str | None) -> tuple[np.ndarray, np.ndarray]:
     return grid.values, grid.voxel_size
 
 
-def _checked(path: Path, values: Any, spacing: np.ndarray) -> tuple[Any, np.ndarray]:
+def _checked(path: str | os.PathLike, values: Any, spacing: np.ndarray) -> tuple[Any, np.ndarray]:
     """The samples, an array or ``Sparse``, in single precision, and the voxel size."""
     numbers = values.blocks if isinstance(values, Sparse) else values
     if numbers.dtype.kind not in "fiub":

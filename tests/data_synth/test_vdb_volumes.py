@@ -340,6 +340,27 @@ def test_a_damaged_grid_of_colour_is_left_out(tmp_path):
     assert "temperature cannot be read and is left out" in str(told[0].message)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("name, what", [("Cd", "colour"), ("temperature", "heat")])
+def test_a_further_grid_of_values_that_are_no_numbers_is_left_out(tmp_path, monkeypatch, bad, name, what):
+    """The density and the other grids are read as if it were not there; without a density nobody knows what was meant."""
+    monkeypatch.setattr("data_synth.vdb_write._Layout._check", lambda *_: None)  # it refuses to write such values
+    path, coords = tmp_path / "a.vdb", np.argwhere(np.ones((3, 3, 3)))
+    ones = {n: np.ones((27, 3) if n == "Cd" else 27, np.float32) for n in ("density", "Cd", "temperature")}
+    ones[name][4] = bad
+    write_grids(path, [SparseGrid(n, coords, values) for n, values in ones.items()])
+    with pytest.warns(RenderWarning) as told:
+        volume = open_volume(path)
+    assert f"{name} cannot be read and is left out" in str(told[0].message)
+    assert "infinite or no number" in str(told[0].message) and f", not {name};" in str(told[1].message)
+    assert volume.density.max() == 1 and getattr(volume, what) is None
+    assert (volume.heat if what == "colour" else volume.colour) is not None
+    ones["density"][4] = bad
+    write_grids(path, [SparseGrid(n, coords, values) for n, values in ones.items()])
+    with pytest.raises(InputError, match=r"a\.vdb:density: expected finite samples, got 1 "):
+        open_volume(path)
+
+
 @pytest.mark.parametrize("kind, message", [
     (b"NonlinearFrustumMap", "its grid density lie in a camera's frustum"),
     (b"UnitaryMap", "transform of its grid density is a Unit"),
