@@ -124,6 +124,7 @@ def _converted(
     """``seen``: the images' cameras and bounds; ``training``: the images, where there is time to train on them; ``scored``:
     views that the result will be compared on."""
     from nerfvol.clouds import PointModel
+    from nerfvol.config.field import DistillConfig
     from nerfvol.config.octree import OctreeConfig
     from nerfvol.config.training import Config
     from nerfvol.neural import FieldModel
@@ -137,7 +138,10 @@ def _converted(
     else:
         scene, cameras = seen[1], convert.small_cameras(*seen)
     octree = OctreeConfig() if options.level is None else OctreeConfig().no_finer_than(options.level)
-    config = Config(time_budget=options.time_budget, seed=options.seed, octree=octree)
+    distill = DistillConfig(level=options.level)
+    config = Config(time_budget=options.time_budget, seed=options.seed, octree=octree, distill=distill)
+    if training is not None:
+        config = config.for_few_views(len(training), training.scene)
     metadata = {k: v for k, v in model.metadata.items() if k in ("orbit", "provenance")} | {
         "background": list(background)
     }
@@ -154,7 +158,7 @@ def _converted(
         return OctreeModel(octree, metadata)
     pictures = convert.seen_by(model, cameras, scene, background)
     if isinstance(model, FieldModel):
-        octree = convert.octree_of_field(model, pictures, background, options.level)
+        octree = convert.octree_of_field(model, pictures, background, config.distill)
         if options.to == "octree":
             if training is not None:
                 octree = convert.tuned_octree(octree, training, background, config, scored)

@@ -171,7 +171,7 @@ class Config(Checked):
         """
         if self._suited(scene) != "octree":
             return self
-        few, budget = n <= self.field.few_views and not scene.is_unbounded, self.time_budget
+        few, budget = self._are_few(n, scene), self.time_budget
         if begun:
             start = "mlp" if "field" in begun else "splats" if "splats" in begun else "auto"
         elif few:
@@ -182,10 +182,18 @@ class Config(Checked):
             if budget is not None and not is_simulated and (scene.is_unbounded or budget > SHORT_RUN):
                 start = "splats" if budget <= until else "mlp"
         init = start if self.init == "auto" else self.init
-        if not few:
-            return dataclasses.replace(self, init=init)
+        return dataclasses.replace(self, init=init).for_few_views(n, scene)
+
+    def for_few_views(self, n: int, scene: SceneBounds) -> Config:
+        """The same with what an octree is given of an object that ``n`` training views show, where these are few and nobody
+        chose it: smoothness, backgrounds and the level at which a field is distilled, whatever the octree begins with."""
+        if not self._are_few(n, scene):
+            return self
         octree, distill = filled(self.octree, FEW_VIEWS), filled(self.distill, FEW_VIEWS_DISTILLED)
-        return dataclasses.replace(self, init=init, octree=octree, distill=distill)
+        return dataclasses.replace(self, octree=octree, distill=distill)
+
+    def _are_few(self, n: int, scene: SceneBounds) -> bool:
+        return n <= self.field.few_views and not scene.is_unbounded
 
     def for_field(self, n: int, scene: SceneBounds, begun: FieldShape | None = None) -> Config:
         """The same with the tables of a field that is the product, where nobody chose them: larger ones of an object that more

@@ -150,7 +150,9 @@ def octree_of(
     views, images = looked_at(SplatModel(splats), fitted, background)
     octree = _with_surfaces(octree_around(splats, scene, cameras, level), views)
     seen = _dataset(fitted, images, scene, SplatModel.kind)
-    trainer = OctreeTrainer(seen, background, OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT), seed, octree)
+    config = Config(octree=OctreeConfig(levels=[level], steps=FITTED_STEPS, **FIT))
+    settings = config.for_few_views(len(fitted), scene).octree
+    trainer = OctreeTrainer(seen, background, settings, seed, octree)
     for step in range(FITTED_STEPS):
         trainer.step(step / FITTED_STEPS)
         if step == 0:
@@ -240,18 +242,16 @@ def _without_lens(camera: Camera) -> Camera:
 
 
 def octree_of_field(
-    model: FieldModel, seen: Dataset, background: Sequence[float], level: int | None = None, say: Say = print
+    model: FieldModel, seen: Dataset, background: Sequence[float], config: DistillConfig | None = None, say: Say = print
 ) -> Octree:
-    """The octree that a field is distilled to (starts/field.py); ``seen``: pictures of it, which say what is visible.
-
-    level: of the finest leaves, along the inner cube; None: as in training on many views.
+    """The octree that a field is distilled to (starts/field.py) as ``config`` says, None: as in training on many views;
+    ``seen``: pictures of it, which say what is visible.
 
     Raises:
         InputError: the field is empty, or nothing of it is seen.
     """
     frame = Frame(model.origin, model.scale)
-    config = DistillConfig(level=level)
-    octree, report = distill(model.field, model.domain, frame.dataset_into(seen), background, config)
+    octree, report = distill(model.field, model.domain, frame.dataset_into(seen), background, config or DistillConfig())
     for message in report.messages:
         say(message)
     return frame.octree_back(octree)

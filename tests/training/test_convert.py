@@ -201,6 +201,22 @@ def test_photographs_are_tuned_with_settings_of_their_own(monkeypatch, is_unboun
     ]
 
 
+@pytest.mark.parametrize("n", [16, 17])
+def test_a_fit_to_few_pictures_is_as_smooth_as_training_on_few(monkeypatch, n):
+    seen = []
+
+    def trainer(dataset, background, settings, seed, octree):
+        seen.append(settings)
+        raise StopIteration
+
+    monkeypatch.setattr(convert, "OctreeTrainer", trainer)
+    with pytest.raises(StopIteration):
+        octree_of(sphere_of_discs(50).splats, SCENE, cameras(n, 20), WHITE, 3)
+    trained = Config(representation="octree").for_views(n, SCENE).octree
+    assert (seen[0].tv_density, seen[0].tv_sh) == (trained.tv_density, trained.tv_sh)
+    assert (seen[0].tv_density is None) == (n > 16)
+
+
 @pytest.mark.parametrize("offset, scale", [((4e5, 5e6, 100.0), 1.0), ((0.0, 0.0, 0.0), 1e6)])
 def test_where_the_scene_is_and_in_what_unit_changes_nothing(monkeypatch, offset, scale):
     """In map coordinates, where float32 tells no two rays apart, and in units a million times smaller."""
