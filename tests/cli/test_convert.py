@@ -56,7 +56,8 @@ def test_there_and_back_with_and_without_images(tmp_path, tiny_scene, command, o
     assert code == 0 and "steps on the photographs" in out, err
     assert max(asked[0].levels) == 5  # no stage splits what was asked for
     # Twelve views are few: smooth, and before two backgrounds, as where train has so many.
-    few = Config(representation="octree").for_views(12, SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, False)).octree
+    scene = SceneBounds(np.array([[-1.0] * 3, [1.0] * 3]), None, False)
+    few = Config(representation="octree").for_views(12, scene).octree
     names = ("tv_density", "tv_sh", "tv_from", "two_backgrounds")
     assert few.two_backgrounds and all(getattr(asked[0], name) == getattr(few, name) for name in names)
 

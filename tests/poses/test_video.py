@@ -8,7 +8,6 @@ from PIL import Image
 
 from nerfvol.errors import InputError
 from nerfvol.files.pictures import open_video
-from nerfvol.measure.sharpness import sharpness
 from nerfvol.poses import video as videos
 from nerfvol.poses.video import Judged, choose_frames, is_high_range, judge_video, write_frames
 
@@ -17,15 +16,6 @@ def blurred(picture, times):
     for _ in range(times):
         picture = sum(np.roll(picture, s, a) for s in (-1, 0, 1) for a in (0, 1)) / 6
     return picture
-
-
-def test_sharpness_is_the_squared_frequency_of_a_wave():
-    """A wave of k radians a pixel: the discrete Laplacian and central difference multiply it by 2 - 2 cos k and sin k."""
-    x = np.arange(400)
-    for k in (0.3, 0.8, 1.5):
-        wave = np.round(127 + 100 * np.sin(k * x))[None].repeat(50, 0).astype(np.uint8)
-        assert sharpness(wave) == pytest.approx((2 - 2 * np.cos(k)) ** 2 / np.sin(k) ** 2, rel=0.02)
-    assert sharpness(np.full((9, 9), 7, np.uint8)) == 0
 
 
 def test_the_sharpest_of_each_part_and_none_where_nothing_moves():
