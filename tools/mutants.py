@@ -252,7 +252,7 @@ MUTANTS = (
     M("nerfvol/files/unchanged.py", "lru_cache(maxsize=most)", "lru_cache(maxsize=0)", SETS, "each split decodes what it is judged by"),
     M("nerfvol/datasets/photographs.py", "fits = self._most is None or self._bytes + more <= self._most", "fits = True", "datasets/test_photographs.py", "photographs are kept without bound"),
     M("nerfvol/datasets/photographs.py", "self._bytes -= view.image.nbytes", "pass", "datasets/test_photographs.py", "what is dropped counts on"),
-    M("nerfvol/training/memory.py", "return dataset.nbytes + kept, kept / wanted", "return kept, kept / wanted", "training/test_memory.py", "the images themselves are not in the estimate"),
+    M("nerfvol/training/memory/splats.py", "return dataset.nbytes + kept, kept / wanted", "return kept, kept / wanted", "training/test_memory.py", "the images themselves are not in the estimate"),
     M("nerfvol/poses/sources.py", "    if not heif:\n        return []\n    return [f", "    if True:\n        return []\n    return [f", "poses/test_sources.py", "HEIC pictures beside others are passed over in silence"),
     M("nerfvol/poses/video.py", "select = _any_of(chosen)", "select = '+'.join(map(_any_of, zip(chosen)))", "poses/test_video.py", "more than 100 frames of a video are refused"),
     M("nerfvol/poses/masks.py", "small) < 255] = 0", "small) < 1] = 0", POSE_MASKS, "smaller pixels that show a part of what is masked are seen"),

@@ -18,7 +18,8 @@ from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
 from nerfvol.training import clock, field_phase, field_trainer, finishing, prepare, session, splat_start
 from nerfvol.training.field_trainer import FieldTrainer
-from nerfvol.training.memory import OctreePlan, gib, octree_bytes
+from nerfvol.training.memory.base import gib
+from nerfvol.training.memory.octree import OctreePlan, octree_bytes
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.scoring import affordable_scores
 from nerfvol.training.session import Run

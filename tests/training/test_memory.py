@@ -16,23 +16,25 @@ from nerfvol.cameras.lens import BrownConrady
 from nerfvol.cameras.paths import orbit
 from nerfvol.datasets import decoding
 from nerfvol.datasets.load import load_dataset
-from nerfvol.datasets.photographs import FACTORS, Photographs
+from nerfvol.datasets.photographs import FACTORS, Photographs, estimate_bytes
 from nerfvol.datasets.store import ImageStore
 from nerfvol.datasets.tiles import TileBank
 from nerfvol.errors import InputError
 from nerfvol.kernels import ops
 from nerfvol.native import native
-from nerfvol.training import memory
-from nerfvol.training.memory import (
+from nerfvol.training.memory.base import gib
+from nerfvol.training.memory.octree import (
+    MOST_LEAVES,
     OtherMemory,
     affordable_leaves,
+    change_bytes,
     estimate_training,
-    gib,
     largest_octree,
     octree_bytes,
     require_memory,
     splits_within,
 )
+from nerfvol.training.memory.splats import photographs_bytes, photographs_held
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.fixtures.runs import settings, start
 from tests.fixtures.tiny import make_sphere_octree, write_scene
@@ -72,9 +74,9 @@ def test_changing_an_octree_takes_what_was_planned_for(degree):
         # A slab of them: leaves with neighbours of their own size, as they are in a surface.
         change(*octree.subdivide(octree.leaf_ijk[:, 2] < np.quantile(octree.leaf_ijk[:, 2], 0.21)))
         share = before / octree_bytes(octree.n_leaves, degree, octree.n_vertices)
-        assert 0.35 < share < 0.5  # memory.BEFORE_SHARE
+        assert 0.35 < share < 0.5  # octree.BEFORE_SHARE
         sizes = octree.n_leaves, degree, octree.n_vertices
-        planned = octree_bytes(*sizes) + memory.change_bytes(*sizes)
+        planned = octree_bytes(*sizes) + change_bytes(*sizes)
         assert 0.9 * planned < tracemalloc.get_traced_memory()[1] < 1.1 * planned
     finally:
         tracemalloc.stop()
@@ -93,7 +95,7 @@ def test_affordable_leaves_fit_and_no_more_would(dataset):
     require_memory(estimate_training(dataset, leaves, 1), free)
     with pytest.raises(InputError):
         require_memory(estimate_training(dataset, int(leaves * 1.01), 1), free)
-    assert affordable_leaves(dataset, 1, available=1 << 50) == memory.MOST_LEAVES - 1
+    assert affordable_leaves(dataset, 1, available=1 << 50) == MOST_LEAVES - 1
     with pytest.raises(InputError, match="training would need"):
         affordable_leaves(dataset, 1, available=150 << 20)
 
@@ -253,16 +255,16 @@ def test_many_photographs_are_shrunk_as_many_at_a_time_as_there_are_threads(tmp_
 def test_what_photographs_keep_is_what_is_stated(tmp_path, share):
     data = load_dataset(many_photographs(tmp_path, 40), "train")
     whole = Photographs(data)
-    bound = int(share * memory.estimate_bytes(whole.cameras, FACTORS))
+    bound = int(share * estimate_bytes(whole.cameras, FACTORS))
     photographs = Photographs(data, most_bytes=bound)
     for factor in FACTORS:
         photographs.level(factor)
-    stated, kept = memory.photographs_held(data, photographs, FACTORS)
+    stated, kept = photographs_held(data, photographs, FACTORS)
     assert 0.9 * stated < data.nbytes + photographs.nbytes <= stated and kept == pytest.approx(min(1, share), rel=1e-3)
 
 
 def test_half_of_the_free_memory_is_for_photographs():
-    assert memory.photographs_bytes(10 << 30) == 5 << 30
+    assert photographs_bytes(10 << 30) == 5 << 30
 
 
 @pytest.mark.skipif(native() is None, reason="the reference path takes minutes")

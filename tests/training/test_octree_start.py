@@ -17,7 +17,9 @@ from nerfvol.region import SceneBounds
 from nerfvol.training import convert, octree_start, train
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.clock import Clock
-from nerfvol.training.memory import LOOK_BYTES, OctreePlan, gib, splat_bytes, starting_splats_bytes
+from nerfvol.training.memory.base import gib
+from nerfvol.training.memory.octree import OctreePlan
+from nerfvol.training.memory.splats import LOOK_BYTES, splat_bytes, starting_splats_bytes
 from nerfvol.training.prepare import is_simulated, load_data
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import make_schedule

@@ -21,8 +21,10 @@ from nerfvol.region import SceneBounds
 from nerfvol.splats.points import dc_of_colour
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.leaves import PIXELS
-from nerfvol.training import convert, memory, octree_start, session, surface_stages, train
+from nerfvol.training import convert, octree_start, session, surface_stages, train
 from nerfvol.training.appearance import Appearance
+from nerfvol.training.memory.octree import OctreePlan
+from nerfvol.training.memory.splats import LOOK_BYTES, SURFACE_BYTES, surface_leaves
 from tests.fixtures.rooms import HALF, draw, facing_cameras, room_cameras, trace_planes, trace_room, write_photographs
 from tests.fixtures.runs import metrics_of, product, run_of, settings, start
 
@@ -243,9 +245,9 @@ def test_no_more_leaves_come_of_splats_than_are_announced():
                       for name in ("means", "log_scales", "quats", "logits", "sh")))  # fmt: skip
     dataset = Dataset(cameras, [np.zeros((120, 160, 3), np.uint8)] * 3, ["a", "b", "c"], bounds, "walls")
     pixels = lens.width * lens.height
-    leaves = memory.surface_leaves(splats.n, pixels)
+    leaves = surface_leaves(splats.n, pixels)
     config = Config(representation="octree", init="splats").for_scene(bounds)
-    sentences = [memory.OctreePlan(config, dataset, 0, 1, n).sentence() for n in (0, leaves)]
+    sentences = [OctreePlan(config, dataset, 0, 1, n).sentence() for n in (0, leaves)]
     before, now = (int(re.search(r"up to ([\d,]+) leaves", line)[1].replace(",", "")) for line in sentences)
     tracemalloc.start()
     try:
@@ -255,7 +257,7 @@ def test_no_more_leaves_come_of_splats_than_are_announced():
         tracemalloc.stop()
     print(splats.n, octree.n_leaves / pixels, octree.n_leaves / splats.n, peak / octree.n_leaves)
     assert before < octree.n_leaves <= now == leaves
-    assert peak <= memory.LOOK_BYTES * 3 * pixels + memory.SURFACE_BYTES * leaves
+    assert peak <= LOOK_BYTES * 3 * pixels + SURFACE_BYTES * leaves
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -303,7 +305,7 @@ def test_leaves_all_around_are_announced(tmp_path):
     walls = Splats(means, scales, np.tile([1.0, 0, 0, 0], (n, 1)), np.full(n, 4.0), dc_of_colour(np.full((n, 3), 0.5)))
     cameras = [camera.scaled(stage[1]) for camera in data.cameras]
     octree = convert.surfaces_of(walls, data.scene, cameras, (1, 1, 1), stage[0])
-    view = memory.surface_leaves(n, lens.width * lens.height // stage[1] ** 2)
+    view = surface_leaves(n, lens.width * lens.height // stage[1] ** 2)
     assert view < octree.n_leaves <= announced
 
 
