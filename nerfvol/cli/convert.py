@@ -129,7 +129,7 @@ def _converted(
     from nerfvol.config.training import Config
     from nerfvol.neural import FieldModel
     from nerfvol.starts.gaussians import splats_of_leaves
-    from nerfvol.training import convert
+    from nerfvol.training import convert, tuning
     from nerfvol.views import OctreeModel, SplatModel
 
     background, model = target.background, target.model
@@ -151,8 +151,8 @@ def _converted(
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
     if isinstance(model, SplatModel | PointModel) and training is not None:
         # What pictures of the splats stand for is at hand.
-        octree, config = convert.surfaces_to_train(model.splats, training, background, config, options.level)
-        return OctreeModel(convert.tuned_octree(octree, training, background, config, scored), metadata)
+        octree, config = tuning.surfaces_to_train(model.splats, training, background, config, options.level)
+        return OctreeModel(tuning.tuned_octree(octree, training, background, config, scored), metadata)
     if isinstance(model, SplatModel | PointModel):
         octree = convert.octree_of(model.splats, scene, cameras, background, options.level, options.seed)
         return OctreeModel(octree, metadata)
@@ -161,14 +161,14 @@ def _converted(
         octree = convert.octree_of_field(model, pictures, background, config.distill)
         if options.to == "octree":
             if training is not None:
-                octree = convert.tuned_octree(octree, training, background, config, scored)
+                octree = tuning.tuned_octree(octree, training, background, config, scored)
             return OctreeModel(octree, metadata)
         model = OctreeModel(octree, metadata)
     assert isinstance(model, OctreeModel)
     if training is None:
         return SplatModel(splats_of_leaves(model.octree, options.max_splats), metadata)
     discs = convert.discs_of(model.octree, pictures, background, options.max_splats)
-    tuned = convert.tuned_splats(discs, training, background, config, scored)
+    tuned = tuning.tuned_splats(discs, training, background, config, scored)
     return SplatModel(tuned.packed, {**metadata, **tuned.metadata})
 
 

@@ -10,7 +10,7 @@ from nerfvol.config.training import Config
 from nerfvol.models import load_model
 from nerfvol.octree.io import save_octree
 from nerfvol.region import SceneBounds
-from nerfvol.training import convert
+from nerfvol.training import convert, tuning
 from nerfvol.training.splat_trainer import SplatTrainer
 from tests.fixtures.runs import TINY
 
@@ -43,13 +43,13 @@ def test_there_and_back_with_and_without_images(tmp_path, tiny_scene, command, o
         "convert", octree_file, "--to", "splats", "--data", tiny_scene, "--time-budget", "0.3s", "--out", tuned
     )
     assert code == 0 and "steps on the photographs" in out and load_model(tuned).metadata["near"] > 0, err
-    tune, asked = convert.tuned_octree, []
+    tune, asked = tuning.tuned_octree, []
 
     def watched(octree, dataset, background, config, *more):
         asked.append(config.octree)
         return tune(octree, dataset, background, config, *more)
 
-    monkeypatch.setattr(convert, "tuned_octree", watched)
+    monkeypatch.setattr(tuning, "tuned_octree", watched)
     code, out, err = command(
         "convert", splats, "--to", "octree", "--level", 5, "--data", tiny_scene, "--time-budget", "0.3s", "--out", again
     )

@@ -11,7 +11,7 @@ from nerfvol.cameras.camera import Intrinsics
 from nerfvol.measure.colour_fit import IDENTITY, apply_map, compose, exposure, fit_colour_map, inverse
 from nerfvol.native import native
 from nerfvol.starts.exposures import Exposures
-from nerfvol.training import train
+from nerfvol.training import begin
 from nerfvol.training.appearance import FIRST_ASKED, MOMENTS, Appearance, centred
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.fixtures.runs import metrics_of, settings, start
@@ -146,14 +146,14 @@ def test_maps_go_through_a_checkpoint():
 
 
 @pytest.mark.parametrize("left,mode,asked", [
-    (None, "auto", True), (12 * train.MEASURED_FROM, "auto", True), (12 * train.MEASURED_FROM - 0.01, "auto", False),
+    (None, "auto", True), (12 * begin.MEASURED_FROM, "auto", True), (12 * begin.MEASURED_FROM - 0.01, "auto", False),
     (0.1, "on", True), (1000.0, "off", False),
 ])  # fmt: skip
 def test_exposures_are_measured_where_a_run_has_a_second_for_each_photograph(monkeypatch, left, mode, asked):
     """They cost up to 0.08 s of each; a run whose checkpoint has maps asks no more."""
     measured = []
     monkeypatch.setattr(
-        train, "measure_exposures", lambda *data: measured.append(1) or Exposures(np.ones((12, 3)), 0.0, 0.0)
+        begin, "measure_exposures", lambda *data: measured.append(1) or Exposures(np.ones((12, 3)), 0.0, 0.0)
     )
     images = [np.zeros((4, 4, 3), np.uint8)] * 12
     dataset = type(
@@ -164,7 +164,7 @@ def test_exposures_are_measured_where_a_run_has_a_second_for_each_photograph(mon
         run = SimpleNamespace(
             data=SimpleNamespace(training=dataset), config=config, phase=phase, seconds_left=lambda: left
         )
-        assert train.appearance_of(run).decided == (asked and phase == "start")
+        assert begin.appearance_of(run).decided == (asked and phase == "start")
     assert len(measured) == asked
 
 

@@ -15,7 +15,7 @@ from nerfvol.rotations import turning_z_to
 from nerfvol.splats.points import dc_of_colour
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.gaussians import splats_of_leaves
-from nerfvol.training import convert, finishing
+from nerfvol.training import convert, finishing, tuning
 from nerfvol.training.convert import cameras_around, discs_of, octree_of, seen_by
 from nerfvol.views import OctreeModel, SplatModel
 from tests.fixtures.tiny import TINY_RADIUS, sphere_colour
@@ -144,9 +144,9 @@ def test_a_time_budget_is_that_of_the_whole_command(monkeypatch, begun, ends):
     """What came before the training counts, and what comes after it, writing and two views to score, is kept: it is over at
     most a step and a look at a picture later. Where nothing is left there is one step."""
     phase = Ticking(begun)
-    monkeypatch.setattr(convert, "process_seconds", lambda: phase.now)
+    monkeypatch.setattr(tuning, "process_seconds", lambda: phase.now)
     monkeypatch.setattr(finishing.time, "perf_counter", lambda: phase.now)
-    convert._run(phase, cameras(1, 0)[0], 40.0, 2, lambda sentence: None)
+    tuning._run(phase, cameras(1, 0)[0], 40.0, 2, lambda sentence: None)
     assert phase.progress[0] == 0
     if ends is None:
         assert len(phase.progress) == 1
@@ -188,12 +188,12 @@ def test_photographs_are_tuned_with_settings_of_their_own(monkeypatch, is_unboun
         seen.append(settings)
         raise StopIteration
 
-    monkeypatch.setattr(convert, "OctreeTrainer", trainer)
+    monkeypatch.setattr(tuning, "OctreeTrainer", trainer)
     scene = SceneBounds(SCENE.aabb, np.array([[-4.0] * 3, [4.0] * 3]) if is_unbounded else None, False)
     dataset = Dataset(cameras(2, 0), [np.zeros((64, 64, 3), np.uint8)] * 2, ["a", "b"], scene, "two views")
     for config in (Config(), Config(octree=OctreeConfig(sparsity=0.5))):
         with pytest.raises(StopIteration):
-            convert.tuned_octree(None, dataset, WHITE, config)
+            tuning.tuned_octree(None, dataset, WHITE, config)
     own = PHOTOGRAPHS_FROM_SURFACES if is_unbounded else {"sparsity": None, "decay_from": None}
     assert [(s.sparsity, s.decay_from) for s in seen] == [
         (own["sparsity"], own["decay_from"]),

@@ -14,13 +14,14 @@ from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
-from nerfvol.training import convert, octree_start, train
+from nerfvol.training import begin, convert, octree_start, train
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.clock import Clock
 from nerfvol.training.memory.base import gib
 from nerfvol.training.memory.octree import OctreePlan
 from nerfvol.training.memory.splats import LOOK_BYTES, splat_bytes, starting_splats_bytes
 from nerfvol.training.prepare import is_simulated, load_data
+from nerfvol.training.progress import progress_bar
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import make_schedule
 from nerfvol.training.splat_start import START_SHARE, START_STEPS, make_schedule_of, settings_of
@@ -120,9 +121,9 @@ def test_splats_whose_octree_fits_nowhere_leave_low_density(tmp_path, tiny_scene
         assert run.config.init == "splats"
         if init == "splats":
             with pytest.raises(InputError, match="training would need"):
-                train.begin_octree(run)
+                begin.begin_octree(run, train.optimise)
         else:
-            assert train.begin_octree(run).first_stage == 0 and run.config.init == "auto"
+            assert begin.begin_octree(run, train.optimise).first_stage == 0 and run.config.init == "auto"
             assert any("start: low density, for with splats first training would need" in sentence for sentence in said)
 
 
@@ -205,11 +206,16 @@ def test_the_larger_of_both_is_announced(tiny_scene):
 def test_an_octree_is_there_sooner_than_from_low_density(tmp_path, tiny_scene):
     """The same 60 steps of the octree, after splats of 120: the picture is better than theirs, and by a decibel better than
     from low density."""
-    lines = []
+    lines, phases = [], []
+
+    def bar(name, done):
+        phases.append(name)
+        return progress_bar(name, done)
+
     splats = settings(tiny_scene, tmp_path / "splats", init="splats", splats={"steps": 120}, checkpoint_every=1000)
-    splats, fog = (metrics_of(start(config, say=lines.append)) for config in
+    splats, fog = (metrics_of(start(config, say=lines.append, bar=bar)) for config in
                    (splats, settings(tiny_scene, tmp_path / "fog", init="direct", checkpoint_every=1000)))  # fmt: skip
-    print(splats["psnr"], fog["psnr"], splats["results"])
+    assert phases == ["splats", "octree", "octree"]
     assert splats["psnr"] > fog["psnr"] + 1
     rows = splats["results"]
     assert (

@@ -21,7 +21,7 @@ from nerfvol.region import SceneBounds
 from nerfvol.splats.points import dc_of_colour
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.leaves import PIXELS
-from nerfvol.training import convert, octree_start, session, surface_stages, train
+from nerfvol.training import begin, convert, octree_start, session, surface_stages, train, tuning
 from nerfvol.training.appearance import Appearance
 from nerfvol.training.memory.octree import OctreePlan
 from nerfvol.training.memory.splats import LOOK_BYTES, SURFACE_BYTES, surface_leaves
@@ -140,18 +140,18 @@ def test_a_conversion_that_is_trained_is_as_fine_as_its_time(monkeypatch, second
     box = np.array([[-1.0] * 3, [1.0] * 3]) + [0.0, 0.0, -5.0]
     bounds = SceneBounds(box, np.array([box.mean(0) - 4, box.mean(0) + 4]), False)
     dataset = Dataset(cameras, [np.zeros((480, 640, 3), np.uint8)] * 10, list("abcdefghij"), bounds, "ten")
-    monkeypatch.setattr(convert, "process_seconds", lambda: 0.0)
+    monkeypatch.setattr(tuning, "process_seconds", lambda: 0.0)
     monkeypatch.setattr(
-        convert, "surfaces_of", lambda splats, scene, cameras, background, level: seen.append((cameras, level))
+        tuning, "surfaces_of", lambda splats, scene, cameras, background, level: seen.append((cameras, level))
     )
     assert 7.5 * surface_stages.RAYS_PER_SECOND < 10 * 640 * 480 < 8 * surface_stages.RAYS_PER_SECOND
-    _, config = convert.surfaces_to_train(discs(5.0, 0.1, 0.1), dataset, (1, 1, 1), Config(time_budget=seconds))
+    _, config = tuning.surfaces_to_train(discs(5.0, 0.1, 0.1), dataset, (1, 1, 1), Config(time_budget=seconds))
     level = surface_stages.finest_level(bounds, [camera.scaled(factor) for camera in cameras]) + (
         seconds in (7.0, 24.0)
     )
     assert seen[0][1] == level and seen[0][0][0].intrinsics.width == 640 // factor
     assert (config.octree.levels, config.octree.downscales) == ([level], [factor])
-    convert.surfaces_to_train(discs(5.0, 0.1, 0.1), dataset, (1, 1, 1), Config(time_budget=seconds), level=6)
+    tuning.surfaces_to_train(discs(5.0, 0.1, 0.1), dataset, (1, 1, 1), Config(time_budget=seconds), level=6)
     assert seen[1][1] == 6 and seen[1][0] is cameras  # what is asked for stays
 
 
@@ -273,11 +273,11 @@ def test_stages_of_ones_own_split_what_splats_became(tmp_path, scene, monkeypatc
     config = settings_of(scene, tmp_path)
     if own:
         config.octree.levels = [6, 6, 7, 7, 8, 8, 9]
-    monkeypatch.setattr(train, "announce", announce)
+    monkeypatch.setattr(begin, "announce", announce)
     run = run_of(config)
     plan = octree_start.prepare_splats(run)
     with pytest.raises(Announced) as said:
-        train.begin_octree(run)
+        begin.begin_octree(run, train.optimise)
     leaves = int(re.search(r"up to ([\d,]+) leaves", str(said.value))[1].replace(",", ""))
     assert (plan.stage is None) == own
     assert leaves == (8**6 if own else plan.leaves) and plan.leaves < 8**6
