@@ -13,14 +13,11 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from nerfvol.cameras.paths import describe_orbit
 from nerfvol.config.training import Config
-from nerfvol.datasets.images import composite_average
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
-from nerfvol.files import pictures, run_folder
+from nerfvol.files import run_folder
 from nerfvol.files.atomic import ensure_writable_folder
 from nerfvol.files.checkpoint import save_checkpoint
 from nerfvol.kernels.state import StepReport
@@ -30,14 +27,13 @@ from nerfvol.models import Model
 from nerfvol.neural import FieldModel
 from nerfvol.training.clock import Clock, first_signal_noted
 from nerfvol.training.compiled_field import compiled_refusal
-from nerfvol.training.finishing import seconds_of_picture, seconds_to_finish, seconds_to_score
+from nerfvol.training.finishing import seconds_to_finish, seconds_to_score
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data, claim_folder, is_simulated
+from nerfvol.training.previews import Previews
 from nerfvol.training.saved import field_begun
 from nerfvol.views import OctreeModel, SplatModel
 
-PREVIEW_SHARE, PREVIEW_SECONDS = 0.01, 0.08
-"""Of a time budget, what previews may take together; and for the first one, before it was measured."""
 LOOK_AGAIN = 0.08
 """Of a time budget: as often, at most, is the time to finish estimated anew because a representation has grown."""
 RUNNING = 0.98
@@ -84,7 +80,9 @@ class Run:
         self._looked, self._size_then = self.clock.elapsed(), ""
         self._last_save = time.perf_counter()
         self._warned: set[str] = set()
-        self._previewed, self._preview_cost = 0.0, PREVIEW_SECONDS  # seconds, of all and of the last
+        self._previews = Previews(
+            self.folder / run_folder.PREVIEWS, data.first, self.background, self.config.time_budget
+        )
 
     def _settled(self, begun: Collection[str]) -> Config:
         """The settings as given, with those that the data decide; ``begun``: the phases that were begun before."""
@@ -249,25 +247,11 @@ class Run:
             self.data.training.release()
 
     def preview(self, phase: Phase, moment: float) -> None:
-        """The first held-out view, small: truth next to what the phase has. A time budget is for training: what previews may
-        take of it is bounded."""
-        budget, started = self.config.time_budget, time.perf_counter()
-        camera, image = self.data.first.cameras[0], self.data.first.images[0]
-        k = max(1, -(-camera.intrinsics.width // phase.preview_width))
-        if budget is not None:
-            if phase.timed_at > 1:
-                self._preview_cost = seconds_of_picture(phase, camera.scaled(k))
-            if self._previewed + self._preview_cost > PREVIEW_SHARE * budget:
-                return
-        truth = np.divide(composite_average(image, self.background, k), 255, dtype=np.float32)
-        picture = pictures.side_by_side([truth, phase.picture(camera.scaled(k))])
-        path = self.folder / run_folder.PREVIEWS / f"{phase.name}_{round(100 * moment):03d}.png"
+        """The first held-out view, small: truth next to what the phase has. One that cannot be written costs a sentence."""
         try:
-            pictures.write_png(path, picture)
+            self._previews.add(phase, moment)
         except InputError as error:
             self.warn(f"{error}; the run goes on without this preview")
-        self._preview_cost = time.perf_counter() - started
-        self._previewed += self._preview_cost
 
     @contextlib.contextmanager
     def interruptible(self) -> Iterator[None]:

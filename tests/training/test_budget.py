@@ -16,7 +16,7 @@ from nerfvol.datasets.dataset import evenly
 from nerfvol.datasets.load import load_dataset
 from nerfvol.files import run_folder
 from nerfvol.octree.io import load_octree
-from nerfvol.training import clock, field_phase, field_trainer, finishing, prepare, session, splat_start
+from nerfvol.training import clock, field_phase, field_trainer, finishing, prepare, previews, session, splat_start
 from nerfvol.training.field_trainer import FieldTrainer
 from nerfvol.training.memory.base import gib
 from nerfvol.training.memory.octree import OctreePlan, octree_bytes
@@ -353,12 +353,12 @@ def test_previews_take_a_hundredth_of_a_budget_at_most(tmp_path, tiny_scene, mon
 
     now = [0.0]
     written = []
-    monkeypatch.setattr(session.pictures, "write_png", lambda path, image: written.append(path.name))
+    monkeypatch.setattr(previews.pictures, "write_png", lambda path, image: written.append(path.name))
     for budget, moments in ((7.0, 0), (20.0, 1), (100.0, 3), (None, 5)):
         run = run_of(settings(tiny_scene, tmp_path, time_budget=budget))
         written.clear()
         with monkeypatch.context() as patch:
-            patch.setattr(session.time, "perf_counter", lambda: now[0])
+            patch.setattr(previews.time, "perf_counter", lambda: now[0])
             for moment in (0.03, 0.1, 0.3, 0.6, 1.0):
                 run.preview(Drawn("octree"), moment)
         assert len(written) == moments
