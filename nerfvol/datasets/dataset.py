@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
-from nerfvol.datasets.images import UInt8, composite, composite_average, map_threads, mask_average, masked_average
+from nerfvol.datasets.averages import composite, composite_average, mask_average, masked_average
+from nerfvol.datasets.images import UInt8, map_threads
 from nerfvol.datasets.points import ModelPoints
 from nerfvol.datasets.store import ImageStore
 from nerfvol.errors import InputError

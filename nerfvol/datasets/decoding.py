@@ -7,17 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nerfvol.datasets.averages import area_average, masked_average
 from nerfvol.datasets.frames import View, unread_sentence
-from nerfvol.datasets.images import (
-    UInt8,
-    area_average,
-    map_threads,
-    masked_average,
-    read_image,
-    read_pixels,
-    turned,
-    writeable,
-)
+from nerfvol.datasets.images import UInt8, map_threads, read_image, read_pixels, turned, writeable
 from nerfvol.datasets.listing import named, require_few
 from nerfvol.datasets.sampled import Sampled
 from nerfvol.errors import InputError

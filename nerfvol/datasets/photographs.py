@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from nerfvol.cameras.camera import Camera, Intrinsics
 from nerfvol.cameras.canvas import MAX_ANGLE, Canvas, canvas_of, is_pinhole, source_grid
 from nerfvol.cameras.warp import padded, reduce, remap
+from nerfvol.datasets.averages import composite_average
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import UInt8, composite_average, map_threads
+from nerfvol.datasets.images import UInt8, map_threads
 from nerfvol.defaults import WHITE
 
 Float = NDArray[np.float32]

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nerfvol.cameras.camera import Intrinsics, tile_pixels, tile_rays
+from nerfvol.datasets.averages import plain_colour
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import plain_colour
 from nerfvol.errors import InputError, shown
 from nerfvol.kernels.state import TILE_RAYS, Batch
 from nerfvol.native import native

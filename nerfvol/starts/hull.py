@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.datasets.averages import area_average
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import UInt8, area_average, map_threads
+from nerfvol.datasets.images import UInt8, map_threads
 from nerfvol.splats.points import PointCloud
 
 Places = NDArray[np.float64]

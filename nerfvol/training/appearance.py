@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerfvol.cameras.camera import Camera
+from nerfvol.datasets.averages import area_average
 from nerfvol.datasets.dataset import Dataset, evenly
-from nerfvol.datasets.images import UInt8, area_average
+from nerfvol.datasets.images import UInt8
 from nerfvol.measure.colour_fit import IDENTITY, SATURATED, apply_map, compose, exposure, fit_colour_map, inverse
 from nerfvol.starts.exposures import Exposures
 

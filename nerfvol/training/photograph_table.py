@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nerfvol.datasets.averages import area_average
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import area_average
 from nerfvol.files.atomic import write_text
 from nerfvol.measure.colour_fit import apply_map, exposure
 from nerfvol.measure.sharpness import sharpness

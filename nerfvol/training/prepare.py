@@ -12,10 +12,10 @@ from typing import Any
 
 from nerfvol.config.assemble import assemble, read_yaml, to_plain, write_yaml
 from nerfvol.config.training import Config
+from nerfvol.datasets.averages import composite_average, plain_colour
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.fingerprint import changes, fingerprint
 from nerfvol.datasets.frame import Frame
-from nerfvol.datasets.images import composite_average, plain_colour
 from nerfvol.datasets.load import load_dataset
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nerfvol.datasets.averages import composite_average
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import composite_average
 from nerfvol.files import pictures
 from nerfvol.training.finishing import seconds_of_picture
 from nerfvol.training.phase import Phase

@@ -9,15 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageFile
 
-from nerfvol.datasets.images import (
-    MAX_PIXELS,
-    area_average,
-    composite,
-    composite_average,
-    image_header,
-    image_size,
-    read_image,
-)
+from nerfvol.datasets.averages import area_average, composite, composite_average
+from nerfvol.datasets.images import MAX_PIXELS, image_header, image_size, read_image
 from nerfvol.errors import InputError
 from tests.fixtures.scenes import png_bytes, random_images
 

@@ -8,7 +8,8 @@ from PIL import Image
 
 from nerfvol.cameras.camera import Intrinsics
 from nerfvol.cameras.lens import Fisheye
-from nerfvol.datasets.images import area_average, masked_average, read_mask
+from nerfvol.datasets.averages import area_average, masked_average
+from nerfvol.datasets.images import read_mask
 from nerfvol.datasets.load import load_dataset
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.datasets.tiles import Cursors, TileBank

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerfvol.cameras.camera import Intrinsics, orbit
+from nerfvol.datasets import averages, tiles
 from nerfvol.datasets import dataset as dataset_module
-from nerfvol.datasets import images, tiles
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.datasets.tiles import Cursor, Cursors, TileBank
 from nerfvol.kernels.state import TILE_RAYS
@@ -185,7 +185,7 @@ def test_two_backgrounds_are_made_a_picture_at_a_time(odd, monkeypatch):
         made.append("composited")
         return composite_average(image, background, k)
 
-    tiles_of, composite_average = tiles._sort_out, images.composite_average
+    tiles_of, composite_average = tiles._sort_out, averages.composite_average
     monkeypatch.setattr(tiles, "_sort_out", sort_out)
     monkeypatch.setattr(dataset_module, "composite_average", composited)
     TileBank(dataclasses.replace(odd, threads=1), WHITE, 1, (0.0, 0.0, 0.0))
