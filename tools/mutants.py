@@ -181,7 +181,7 @@ MUTANTS = (
     M("nerfvol/files/checkpoint.py", 'number if math.isfinite(number) else ["float", repr(number)]', "number", "files/test_checkpoint.py", "numbers that JSON lacks"),
     M("nerfvol/files/arrayfile.py", "key=lambda name: (-ordered[name].itemsize, -_row_bytes(ordered[name]), name)", "key=str", "files/test_checkpoint.py", "arrays off their alignment"),
     M("nerfvol/files/numpyfile.py", "if not isinstance(array, np.ndarray):", "if False:", "measure/test_truth.py", "members of archives that are no arrays"),
-    M("nerfvol/config/values.py", '"m": 60.0', '"m": 1.0', "config/test_config.py", "minutes"),
+    M("nerfvol/config/parsers.py", '"m": 60.0', '"m": 1.0', "config/test_config.py", "minutes"),
     M("nerfvol/config/values.py", "or self.open and value == self.low", "", "config/test_config.py", "open intervals"),
     M("nerfvol/datasets/holdout.py", 'np.argsort(distance, kind="stable")[:', 'np.argsort(-distance, kind="stable")[:', "datasets/test_holdout.py", "the farthest views are the arc"),
     M("nerfvol/viewer/server.py", "if not hmac.compare_digest(given.encode(), server.token.encode()):", "if False:", "viewer/test_server.py", "no token needed"),

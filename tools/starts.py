@@ -23,7 +23,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from nerfvol.config.values import seconds as seconds_of
+from nerfvol.config.parsers import seconds as seconds_of
 from nerfvol.datasets.dataset import evenly
 
 BUSY = 1.6

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from nerfvol.cli.command import Command, need, set_threads
 from nerfvol.cli.photographs import SCENE
-from nerfvol.config.values import Count, Seconds, at_least, within
+from nerfvol.config.parsers import Seconds
+from nerfvol.config.values import Count, at_least, within
 from nerfvol.errors import InputError, shown
 
 if TYPE_CHECKING:

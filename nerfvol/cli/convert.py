@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
-from nerfvol.config.values import Colour, Count, seconds, within
+from nerfvol.config.parsers import Colour, seconds
+from nerfvol.config.values import Count, within
 from nerfvol.errors import InputError
 
 if TYPE_CHECKING:

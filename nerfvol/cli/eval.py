@@ -13,7 +13,8 @@ from nerfvol import __version__
 from nerfvol.cli.command import FITTED, POSED, Command, add_drawing, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
-from nerfvol.config.values import Colour, Count, fraction, pixels
+from nerfvol.config.parsers import Colour, fraction, pixels
+from nerfvol.config.values import Count
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 

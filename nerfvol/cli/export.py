@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from nerfvol.cli.command import Command, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
 from nerfvol.config.assemble import run_settings
-from nerfvol.config.values import Count, box, byte_count, fraction
+from nerfvol.config.parsers import box, byte_count, fraction
+from nerfvol.config.values import Count
 from nerfvol.export import EXPORTS, choose, export_model
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from nerfvol.cli.command import Command, add_drawing, add_target, need, prepare_outputs, set_threads
 from nerfvol.cli.target import Target, open_target
-from nerfvol.config.values import Colour, Count, Frames, Size, above, aov_names, fraction, frame_choice, pixels
+from nerfvol.config.parsers import Colour, Frames, Size, aov_names, fraction, frame_choice, pixels
+from nerfvol.config.values import Count, above
 from nerfvol.defaults import DEFAULT_EARLY_STOP, DEFAULT_LOD
 from nerfvol.errors import InputError
 

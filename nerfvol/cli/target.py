@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfvol.config.assemble import run_settings
-from nerfvol.config.values import Colour, coerce
+from nerfvol.config.parsers import Colour
+from nerfvol.config.values import coerce
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError, shown
 from nerfvol.files.run_folder import model_path

@@ -18,8 +18,9 @@ from nerfvol.config.medium import MediumConfig
 from nerfvol.config.octree import FEW_VIEWS, OctreeConfig
 from nerfvol.config.octree import SceneChoices as SceneChoices
 from nerfvol.config.octree import finest_level as finest_level
+from nerfvol.config.parsers import Colour, Seconds, box, seconds
 from nerfvol.config.splats import SplatConfig
-from nerfvol.config.values import Checked, Colour, Count, Seconds, box, filled, seconds, within
+from nerfvol.config.values import Checked, Count, filled, within
 from nerfvol.defaults import WHITE
 from nerfvol.errors import InputError
 

@@ -141,7 +141,7 @@ def ladder_figure(record: Mapping[str, Any]) -> Any:
 
 def budgets(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Training settings by budget: "30s", "5m" is wall-clock time, "500steps" a number of steps."""
-    from nerfvol.config.values import seconds
+    from nerfvol.config.parsers import seconds
 
     out: dict[str, dict[str, Any]] = {}
     for text in texts:

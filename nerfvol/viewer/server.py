@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from nerfvol.config.values import box
+from nerfvol.config.parsers import box
 from nerfvol.errors import InputError
 from nerfvol.export.page import build_page
 from nerfvol.files.atomic import explain_os_error

@@ -13,21 +13,10 @@ import pytest
 from nerfvol.config.assemble import assemble, parse_assignment, read_yaml, to_plain, write_yaml
 from nerfvol.config.field import DistillConfig, FieldConfig, FieldShape
 from nerfvol.config.octree import FINEST_LEVEL, OctreeConfig
+from nerfvol.config.parsers import Colour, colour, seconds
 from nerfvol.config.splats import SplatConfig
 from nerfvol.config.training import Config
-from nerfvol.config.values import (
-    Checked,
-    Colour,
-    Count,
-    above,
-    at_least,
-    colour,
-    hints_of,
-    increasing_to_one,
-    same_length,
-    seconds,
-    within,
-)
+from nerfvol.config.values import Checked, Count, above, at_least, hints_of, increasing_to_one, same_length, within
 from nerfvol.errors import InputError
 from nerfvol.region import SceneBounds
 
