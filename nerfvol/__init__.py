@@ -20,7 +20,8 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from nerfvol.cameras.camera import Camera, Intrinsics, look_at, orbit
+    from nerfvol.cameras.camera import Camera, look_at, orbit
+    from nerfvol.cameras.intrinsics import Intrinsics
     from nerfvol.config.training import Config
     from nerfvol.datasets.dataset import Dataset
     from nerfvol.datasets.load import load_dataset
@@ -36,7 +37,7 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "Camera": "cameras.camera", "Intrinsics": "cameras.camera", "look_at": "cameras.camera", "orbit": "cameras.camera",
+    "Camera": "cameras.camera", "Intrinsics": "cameras.intrinsics", "look_at": "cameras.camera", "orbit": "cameras.camera",
     "Config": "config.training", "Dataset": "datasets.dataset", "load_dataset": "datasets.load", "InputError": "errors",
     "Octree": "octree.tree", "Splats": "splats.splats", "load_model": "models", "save_model": "models", "render_image": "views",
 }  # fmt: skip

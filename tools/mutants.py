@@ -49,8 +49,8 @@ TRANSPORT, FITTING = "medium/test_transport.py", "training/test_medium_trainer.p
 SETS, EXPOSURES, POSE_MASKS = "datasets/test_dataset.py", "starts/test_exposures.py", "poses/test_masks.py"
 MUTANTS = (
     # ---------------------------------------------------------------- cameras
-    M("nerfvol/cameras/camera.py", "np.arange(width) + 0.5\n        band", "np.arange(width)\n        band", "cameras", "rays through pixels' corners"),
-    M("nerfvol/cameras/camera.py", "fx=self.fx / k, fy=self.fy / k, cx=self.cx / k", "fx=self.fx / k, fy=self.fy / k, cx=self.cx", "cameras", "the principal point of smaller pictures"),
+    M("nerfvol/cameras/intrinsics.py", "np.arange(width) + 0.5\n        band", "np.arange(width)\n        band", "cameras", "rays through pixels' corners"),
+    M("nerfvol/cameras/intrinsics.py", "fx=self.fx / k, fy=self.fy / k, cx=self.cx / k", "fx=self.fx / k, fy=self.fy / k, cx=self.cx", "cameras", "the principal point of smaller pictures"),
     M("nerfvol/cameras/pose.py", "return rigid_pose(whole), float(np.prod(lengths)) ** (1 / 3)", "return rigid_pose(matrix), 1.0", PEOPLE, "scaled axes are refused"),
     M("nerfvol/cameras/lens.py", "x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y", "x * radial + 2 * p1 * x * y - p2 * (s + 2 * x * x), y", "cameras", "a sign in the tangential distortion"),
     M("nerfvol/cameras/lens.py", "found = done & (theta <= fold)", "found = done", MASKS + "::test_the_second_branch_of_a_lens_is_no_picture", "a lens's second branch is taken for its picture"),

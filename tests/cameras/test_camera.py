@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerfvol.cameras.calibration import CAMERA_MODELS, lens_keys, read_calibration
-from nerfvol.cameras.camera import Camera, Intrinsics, _DirectionCache, look_at, orbit, tile_pixels, tile_rays
+from nerfvol.cameras.camera import Camera, look_at, orbit, tile_pixels, tile_rays
 from nerfvol.cameras.further_lenses import FieldOfView, Rational
+from nerfvol.cameras.intrinsics import Intrinsics, _DirectionCache
 from nerfvol.cameras.lens import PINHOLE as NO_DISTORTION
 from nerfvol.cameras.lens import BrownConrady, Fisheye, Lens
 from nerfvol.cameras.pose import rigid_pose
