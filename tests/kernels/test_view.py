@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from nerfvol.cameras.camera import Intrinsics
+from nerfvol.cameras.camera import Intrinsics, look_at
 from nerfvol.kernels import ops
 from nerfvol.kernels.state import from_squares, in_squares
 from nerfvol.octree.tree import Octree
+from nerfvol.sh import eval_basis
 from tests.fixtures.random_octrees import DYADIC, ODD, random_octree
 
 
@@ -80,6 +81,31 @@ def test_a_small_cell_is_shaded_along_the_ray_to_its_middle(isa, degree):
         assert moved.max() <= bound + rounding and (moved.max() > rounding) == (degree > 0)
         for name in ("opacity", "normal"):
             np.testing.assert_allclose(quick[name], exact[name], rtol=0, atol=rounding, err_msg=name)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_small_cell_has_the_colour_of_the_direction_to_its_middle(isa, degree):
+    """One opaque cell, 70 sides away: all of it has one colour, that of the harmonics in float64; shaded ray by ray it has not.
+    One of 60 sides away is not small."""
+    rng = np.random.default_rng(degree)
+    octree = Octree.from_leaves([6], [(41, 20, 33)], (-1.0, -1.0, -1.0), 2.0, degree, 100.0)
+    octree.density = 50.0  # optical thickness 156 along a side
+    octree.sh = np.broadcast_to(rng.normal(0, 0.3, (1, *octree.sh.shape[1:])), octree.sh.shape)
+    middle, side = octree.leaf_centers()[0], octree.leaf_sizes()[0]
+    for away in (70, 60):
+        towards = np.array([0.48, -0.6, 0.64])
+        pose = look_at(middle - away * side * towards, middle, (0.0, 0.0, 1.0))
+        lens = Intrinsics(45, 35, 20.0 * away, 20.0 * away, 22.5, 17.5)
+        view = ops.View(in_squares(lens.directions()), pose, 35, 45)
+        exact, quick = (ops.render_view(octree, view, (0.1, 0.5, 0.9), 0.0, small=small) for small in (0.0, 1 / 64))
+        solid = quick["opacity"] > 1 - 1e-6
+        assert solid.sum() > 200
+        want = 0.5 + octree.sh[0].astype(float) @ eval_basis(degree, towards)
+        # 60 operations on numbers up to 3, as above, and the background through 1e-6; the harmonics move by more than 1e-3.
+        tolerance = 60 * 3 * 2**-24 + 1e-6
+        assert (np.abs(exact["rgb"] - want)[solid].max() > 1e-3) and (
+            (np.abs(quick["rgb"] - want)[solid].max() < tolerance) == (away > 64)
+        )
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -138,6 +138,20 @@ def test_packed_files_that_end_early_or_lack_their_chunks(tmp_path):
         load_ply(path)
 
 
+@pytest.mark.parametrize("old, new, words", [
+    (b"uint packed_color", b"int packed_color", "'packed_color' should be uint32, it is int32"),
+    (b"float max_scale_z", b"uint max_scale_z", "'max_scale_z' should be float32, it is uint32"),
+    (b"uchar f_rest_8", b"char f_rest_8", "'f_rest_8' should be uint8, it is int8"),
+    (b"uchar f_rest_8", b"uchar f_more_8", "element 'sh' has no property 'f_rest_8'"),
+])  # fmt: skip
+def test_packed_numbers_of_another_type_or_name(tmp_path, old, new, words):
+    """Of the same length, so that nothing else tells."""
+    path = compressed(tmp_path / "bad.ply", [unit_chunk()], [(0, 0, 0, 0)], [[0] * 9])
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with pytest.raises(InputError, match=rf"bad\.ply.*{words}"):
+        load_ply(path)
+
+
 def test_a_packed_file_whose_chunks_have_a_list(tmp_path):
     """Behind the vertices, where its rows need not be passed over."""
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
