@@ -1,5 +1,6 @@
 """Every command line that the documents show is one: its options exist and its settings are accepted."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 from nerfvol.cli.command import assemble_options
 from nerfvol.cli.main import _build_parser, commands
+from tests.fixtures.runs import TINY
 
 ROOT = Path(__file__).resolve().parents[2]
 DATED = ("experiments.md",)
@@ -46,6 +48,22 @@ def test_a_command_of_the_documents_is_one(line):
     command = known[options.pop("command")]
     if command.options is not None and "config" not in options:
         assemble_options(command.options, options)
+
+
+def test_the_first_commands_run_one_after_the_other(command, tiny_scene, tmp_path, monkeypatch):
+    """Those of the README as they stand there, but for ten steps and three pictures; the viewer has tests of its own."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").symlink_to(tiny_scene, target_is_directory=True)
+    few = {"steps": 10, "levels": [4], "downscales": [2], "stage_ends": [1.0], "tiles": [16], "prunes": [1]}
+    (tmp_path / "few.yaml").write_text(json.dumps({**TINY, "octree": few, "checkpoint_every": 100}))
+    lines = command_lines((ROOT / "README.md").read_text())
+    assert [line.split()[1] for line in lines[:7]] == ["train", "eval", "render", "export", "export", "view", "info"]
+    for line in (*lines[:5], lines[6]):
+        line = line.replace("--time-budget 2m", "--init direct --config few.yaml").replace("--orbit 120", "--orbit 3")
+        code, _, err = command(*shlex.split(line)[1:])
+        assert code == 0, f"{line}: {err}"
+    for written in re.findall(r"--out (\S+)", "\n".join(lines[:7])):
+        assert (tmp_path / written).stat().st_size > 0, written
 
 
 def test_commands_are_found():
