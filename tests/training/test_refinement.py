@@ -12,7 +12,7 @@ from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint
 from nerfvol.models import load_model
 from nerfvol.native import native
-from nerfvol.training.splat_trainer import MOTION_DECAY, MOTION_PIXELS
+from nerfvol.training.splat_trainer import MOTION_DECAY, MOTION_PIXELS, SplatTrainer
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.fixtures.runs import metrics_of, settings, start
 
@@ -68,17 +68,16 @@ def test_planted_errors_are_won_back_and_exact_poses_stay(scenes, tmp_path):
 def test_a_resumed_run_has_the_same_poses(scenes, tmp_path):
     short = {"splats": {"steps": 60, "grow_every": 25, "max_splats": 800}, "refine_poses": True}
     whole = run(scenes[1], tmp_path / "whole", **short)
-    from nerfvol.training import train
 
     with pytest.MonkeyPatch.context() as patch:
-        step = train.SplatTrainer.step
+        step = SplatTrainer.step
 
         def stop(self, progress):
             if self.steps_done == 41:
                 raise RuntimeError("killed")
             return step(self, progress)
 
-        patch.setattr(train.SplatTrainer, "step", stop)
+        patch.setattr(SplatTrainer, "step", stop)
         with pytest.raises(RuntimeError, match="killed"):
             run(scenes[1], tmp_path / "part", **short, checkpoint_every=1e-9)
     state = load_checkpoint(tmp_path / "part" / "checkpoint.safetensors")["trainer"]["motions"]
