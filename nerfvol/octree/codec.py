@@ -104,10 +104,12 @@ def decode(
         else:
             np.multiply(codes, np.float32(sh_step), out=rotated[index - 1])
 
+    def turn_back(k: int) -> None:  # in place: this is most of the memory that loading takes
+        rotated[k::basis_dim] = (rotated[k::basis_dim].T @ TO_GREY).T
+
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         list(pool.map(channel, range(n_channels)))
-    for k in range(basis_dim):  # in place: this is most of the memory that loading takes
-        rotated[k::basis_dim] = (rotated[k::basis_dim].T @ TO_GREY).T
+        list(pool.map(turn_back, range(basis_dim)))
     return density, rotated.reshape(3, basis_dim, n_vertices).transpose(2, 0, 1)
 
 

@@ -17,7 +17,7 @@ from nerfvol.training.appearance import fitting_factor
 from nerfvol.training.phase import Phase
 from nerfvol.training.prepare import Data
 
-RESERVE_SHARE = 0.2
+RESERVE_SHARE = 0.1
 """Of a time budget, the most that is kept for writing and scoring, ..."""
 LARGEST_RESERVE = 0.5
 """... or this, where writing, reading, the table of photographs and FEWEST_SCORED views, which come in any case, take more."""

@@ -12,7 +12,7 @@ from nerfvol.measure.colour_fit import IDENTITY, apply_map, compose, exposure, f
 from nerfvol.native import native
 from nerfvol.starts.exposures import Exposures
 from nerfvol.training import begin
-from nerfvol.training.appearance import FIRST_ASKED, MOMENTS, Appearance, centred
+from nerfvol.training.appearance import ASKED_FOR_SPREAD, FIRST_ASKED, MOMENTS, SPREAD, Appearance, centred
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.fixtures.runs import metrics_of, settings, start
 
@@ -109,6 +109,19 @@ def test_fog_takes_no_bright_side_for_an_exposure():
     asked.clear()
     assert appearance.fit(lambda i: asked.append(i) or clear(i), MOMENTS[1])
     assert sorted(asked) == list(range(12))  # none is drawn twice
+
+
+@pytest.mark.parametrize(("spread", "asked"), [(0.02, ASKED_FOR_SPREAD), (0.06, 100), (0.12, 100)])
+def test_some_of_many_photographs_tell_that_exposures_are_even(spread, asked):
+    """Drawing all of a hundred photographs takes a twentieth of a short run; where some differ, all are asked."""
+    scene = np.random.default_rng(0).uniform(0, 0.7, (20, 30, 3))
+    random = np.random.default_rng(1).standard_normal(100)
+    gains = 1 + spread * (random - random.mean()) / random.std(ddof=1)
+    clear, drawn = seen_with(gains, scene), set()
+    appearance = Appearance(100)
+    used = appearance.fit(lambda i: drawn.add(i) or clear(i), MOMENTS[0])
+    assert len(drawn) >= asked if asked == 100 else len(drawn) <= asked + FIRST_ASKED
+    assert used == (spread > SPREAD) and appearance.decided
 
 
 def test_uneven_photographs_come_to_one_exposure():

@@ -285,14 +285,14 @@ def test_a_field_tells_what_a_picture_takes_by_a_small_one(tmp_path, tiny_scene,
     (0.01, 0.0, 0.02 * 1.1), (0.01, 100.0, 5.0), (1.5, 0.0, 3.0), (1.5, 0.75, 3.75), (100.0, 0.0, 5.0), (0.01, 1.98, 2.0),
 ])  # fmt: skip
 def test_what_comes_in_any_case_has_its_time(tmp_path, tiny_scene, monkeypatch, seconds, writing, kept):
-    """By a clock that goes on so many seconds a picture, 10 s in all: a fifth, or writing and two views, or half."""
+    """By a clock that goes on so many seconds a picture, 10 s in all: a tenth, or writing and two views, or half."""
     now = [0.0]
     phase = Pretended("octree", writing=writing)
     monkeypatch.setattr(session.time, "perf_counter", lambda: now[0])
     phase.picture = lambda camera: now.__setitem__(0, now[0] + seconds)
     run = run_of(settings(tiny_scene, tmp_path, time_budget=10.0))
     assert run._time_to_finish(phase) == pytest.approx(kept, rel=0.02)
-    assert run._time_to_finish() == pytest.approx(2.0)  # nothing is known of its pictures
+    assert run._time_to_finish() == pytest.approx(1.0)  # nothing is known of its pictures
 
 
 def test_photographs_that_were_released_are_read_again(tmp_path, tiny_scene, monkeypatch):

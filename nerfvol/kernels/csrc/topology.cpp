@@ -42,49 +42,68 @@ int64_t number_corners(const int8_t* level, const int32_t* ijk, int64_t n, int m
     std::vector<int32_t> table(std::size_t(capacity), -1);
     std::vector<uint64_t> keys;  // of the vertices so far
     keys.reserve(std::size_t(2 * n));
-    const auto slot_of = [&](uint64_t key) {  // neighbours in space stay neighbours in the table
-        const uint64_t h = (key >> 6) * 0x9E3779B97F4A7C15ull;
-        return ((h >> 20) * 64 + (key & 63)) & uint64_t(capacity - 1);
+    // Neighbours in space stay neighbours in the table: 4x4x4 corners of leaves of the commonest level, and of finer
+    // leaves those that lie alike between them.
+    int64_t of_level[64] = {};
+    for (int64_t leaf = 0; leaf < n; ++leaf) ++of_level[level[leaf] & 63];
+    const int between = 3 * int(max_level - (std::max_element(of_level, of_level + 64) - of_level));
+    const uint64_t finer = (uint64_t(1) << between) - 1;
+    const auto slot_of = [&](uint64_t key) {
+        const uint64_t h = ((key >> between >> 6) * 0x9E3779B97F4A7C15ull) ^ ((key & finer) * 0xC2B2AE3D27D4EB4Full);
+        return ((h >> 20) * 64 + (key >> between & 63)) & uint64_t(capacity - 1);
     };
-    int32_t of_siblings[27];  // vertices of the lattice that siblings share: they follow each other, and one look-up does for all
+    const auto grow = [&] {
+        capacity *= 2;
+        table.assign(std::size_t(capacity), -1);
+        for (std::size_t v = 0; v < keys.size(); ++v) {
+            uint64_t s = slot_of(keys[v]);
+            while (table[s] >= 0) s = (s + 1) & uint64_t(capacity - 1);
+            table[s] = int32_t(v);
+        }
+    };
+    struct Named { uint64_t key, slot; };
+    constexpr int64_t kFew = 128;      // leaves at a time: what they ask of the table comes from memory meanwhile
+    Named named[8 * kFew];
+    int32_t number[8 * kFew];
     // In calls of some leaves: WebAssembly's engines put faster code in place only from one call to the next.
-    const auto number = [&](int64_t from, int64_t to) __attribute__((noinline)) {
+    const auto number_few = [&](int64_t from, int64_t to) __attribute__((noinline)) {
+        int32_t of_siblings[27];  // of the lattice that siblings share: they follow each other, and one look-up does for all
+        int32_t n_named = 0;
+        while (2 * int64_t(keys.size() + 8 * kFew) > capacity) grow();
         for (int64_t leaf = from; leaf < to; ++leaf) {
             const int shift = max_level - level[leaf];
             const int32_t* const at = ijk + 3 * leaf;
-            const bool sibling = leaf && level[leaf] == level[leaf - 1] && !((at[0] ^ at[-3]) >> 1 | (at[1] ^ at[-2]) >> 1 | (at[2] ^ at[-1]) >> 1);
+            const bool sibling = leaf > from && level[leaf] == level[leaf - 1] && !((at[0] ^ at[-3]) >> 1 | (at[1] ^ at[-2]) >> 1 | (at[2] ^ at[-1]) >> 1);
             if (!sibling) std::fill_n(of_siblings, 27, -1);
             const int octant = (at[0] & 1) << 2 | (at[1] & 1) << 1 | (at[2] & 1);
             for (int o = 0; o < 8; ++o) {
                 int32_t& known = of_siblings[lattice_place(octant, o)];
-                if (known >= 0) {
-                    ids[8 * leaf + o] = known;
-                    continue;
+                if (known < 0) {
+                    uint64_t p[3];
+                    for (int axis = 0; axis < 3; ++axis) p[axis] = uint64_t(at[axis] + (o >> (2 - axis) & 1)) << shift;
+                    const uint64_t key = spread_bits(p[0]) << 2 | spread_bits(p[1]) << 1 | spread_bits(p[2]);
+                    const uint64_t slot = slot_of(key);
+                    __builtin_prefetch(&table[slot]);
+                    named[n_named] = {key, slot};
+                    known = n_named++;
                 }
-                if (2 * int64_t(keys.size()) >= capacity) {
-                    capacity *= 2;
-                    table.assign(std::size_t(capacity), -1);
-                    for (std::size_t v = 0; v < keys.size(); ++v) {
-                        uint64_t s = slot_of(keys[v]);
-                        while (table[s] >= 0) s = (s + 1) & uint64_t(capacity - 1);
-                        table[s] = int32_t(v);
-                    }
-                }
-                uint64_t p[3];
-                for (int axis = 0; axis < 3; ++axis) p[axis] = uint64_t(ijk[3 * leaf + axis] + (o >> (2 - axis) & 1)) << shift;
-                const uint64_t key = spread_bits(p[0]) << 2 | spread_bits(p[1]) << 1 | spread_bits(p[2]);
-                uint64_t s = slot_of(key);
-                while (table[s] >= 0 && keys[std::size_t(table[s])] != key) s = (s + 1) & uint64_t(capacity - 1);
-                if (table[s] < 0) {
-                    table[s] = int32_t(keys.size());
-                    keys.push_back(key);
-                }
-                known = ids[8 * leaf + o] = table[s];
+                ids[8 * leaf + o] = known;
             }
         }
+        for (int32_t i = 0; i < n_named; ++i)
+            if (const int32_t there = table[named[i].slot]; there >= 0) __builtin_prefetch(&keys[std::size_t(there)]);
+        for (int32_t i = 0; i < n_named; ++i) {
+            uint64_t s = named[i].slot;
+            while (table[s] >= 0 && keys[std::size_t(table[s])] != named[i].key) s = (s + 1) & uint64_t(capacity - 1);
+            if (table[s] < 0) {
+                table[s] = int32_t(keys.size());
+                keys.push_back(named[i].key);
+            }
+            number[i] = table[s];
+        }
+        for (int64_t i = 8 * from; i < 8 * to; ++i) ids[i] = number[ids[i]];
     };
-    constexpr int64_t kFew = 4096;
-    for (int64_t leaf = 0; leaf < n; leaf += kFew) number(leaf, std::min(n, leaf + kFew));
+    for (int64_t leaf = 0; leaf < n; leaf += kFew) number_few(leaf, std::min(n, leaf + kFew));
     return int64_t(keys.size());
 }
 
