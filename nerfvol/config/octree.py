@@ -46,7 +46,7 @@ class OctreeConfig(Checked):
         "smooth_colour": "tv_sh",
         "smooth_from": "tv_from",
         "coverage": "pruning always waits until half of the foreground tiles were seen",
-        "beta": "it is always 0.98",
+        "beta": "it is always 0.95",
         "final_prune_weights": "they are always 0.04, 0.02 and 0.01, and final_prune_loss chooses among them",
         "fine_from": "stages from level 9 on split leaves once",
         "fine_steps": "a stage from level 9 on is always left out where fewer than 2500 steps would be left for it",

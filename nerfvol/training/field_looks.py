@@ -32,6 +32,9 @@ def look(state: FieldState, grid: Occupancy, seed: int, step: int) -> None:
     Raises:
         EmptyModel: nothing is left.
     """
+    probes = step > SWEEPS[-1] and step % PROBE_EVERY == 0
+    if not (probes or step in SWEEPS or step in THINNED):
+        return  # before the random numbers: beginning a sequence takes as long as a twentieth of a step
     rng = np.random.Generator(np.random.Philox(key=[seed, 1 + step]))
 
     def seen(cells: np.ndarray, size: int) -> np.ndarray:
@@ -45,13 +48,11 @@ def look(state: FieldState, grid: Occupancy, seed: int, step: int) -> None:
         apart = -(-len(held) // MOST_LOOKED)
         held = held[rng.integers(apart) :: apart]
         grid.note(held, seen(held, 1), THIN_DECAY)
-    elif step > SWEEPS[-1] and step % PROBE_EVERY == 0:
+    else:
         held = grid.held()
         anywhere = rng.integers(len(grid.sigmas), size=PROBES // 2)
         cells = np.concatenate([anywhere, held[rng.integers(len(held), size=PROBES // 2)]])
         grid.note(cells, seen(cells, 1))
-    else:
-        return
     grid.refresh()
     if grid.thickest() < 1 / (255 * math.sqrt(3) * grid.resolution):  # a whole ray would not change an 8-bit colour
         raise EmptyModel(

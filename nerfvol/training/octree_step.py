@@ -11,7 +11,7 @@ from nerfvol.kernels import ops
 
 BACKGROUND_STREAM = 2
 """Stream of random numbers of the random background of photographs; TileBank has 0 and 1."""
-BETA = 0.98
+BETA = 0.95
 """Memory, per step, of RMSprop's second moments."""
 
 
