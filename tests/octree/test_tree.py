@@ -274,3 +274,30 @@ def test_explin_is_positive_and_inverts(raw):
     value = explin(np.array(raw))
     assert value > 0
     assert np.isclose(explin_inverse(value), raw, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.skipif(native() is None, reason="no compiled kernels")
+@given(
+    indices,
+    st.sampled_from([1, 127, 128, 129, 5000, 9000]),
+    st.lists(st.integers(0, MAX_LEVEL), min_size=1, max_size=5),
+    examples=12,
+)
+def test_corners_of_many_leaves_are_numbered_as_numpy_does(seed, n, levels):
+    """Of levels that do not occur between others, in any order: siblings in a row, some named across the ends of batches, and
+    leaves far from each other, which name up to eight vertices each, so that the table grows."""
+    rng = np.random.default_rng(seed)
+    level = rng.choice(np.array(levels, np.int8), n)
+    ijk = (rng.random((n, 3)) * 2.0 ** level[:, None]).astype(np.int32)
+    blocks = rng.random((n + 7) // 8) < 0.5  # eights that are siblings, but for the last
+    eight, octant = np.divmod(np.arange(n), 8)
+    family = blocks[eight] & (level[8 * eight] > 0)
+    level = np.where(family, level[8 * eight], level)
+    ijk = np.where(family[:, None], ijk[8 * eight] & ~1 | OFFSETS[octant], ijk).astype(np.int32)
+    start = rng.integers(min(n, 8))  # so that a batch ends among siblings
+    level, ijk = np.ascontiguousarray(level[start:]), np.ascontiguousarray(ijk[start:])
+    corners, vertices = module.number_corners(level, ijk)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "native", lambda: None)
+        plain, plain_vertices = module.number_corners(level, ijk)
+    assert vertices == plain_vertices and np.array_equal(corners, plain)
