@@ -30,9 +30,7 @@ from nerfvol.measure.scores import COLOUR_MAPS, evaluate
 from nerfvol.models import Model, load_model
 from nerfvol.training.begin import begin_field, begin_medium, begin_octree, begin_splats
 from nerfvol.training.clock import Clock
-from nerfvol.training.octree_start import (
-    summary,
-)
+from nerfvol.training.octree_start import summary
 from nerfvol.training.phase import FinalPhase, Phase
 from nerfvol.training.photograph_table import write_table
 from nerfvol.training.prepare import check_folder, load_data, require_same
