@@ -12,6 +12,7 @@ themselves before the start; only where they share too little to be compared the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -38,7 +39,7 @@ FIRST_ASKED = 8
 """Photographs, evenly chosen, of which that is asked first: drawing all of them in fog would take a short run's seconds."""
 ASKED_FOR_SPREAD = 24
 """... of which it is asked next whether exposures differ at all: the rest are drawn only where these do by half of SPREAD. With
-a spread of SPREAD so many show less than half of it once in 100,000 times (chi-squared of 23 degrees below 23 / 4)."""
+a spread of SPREAD so many show less than half of it once in 10,000 times (chi-squared of 23 degrees below 23 / 4)."""
 AGREEMENT = 0.6
 """Correlation of the exposures of left and right halves from which on these are the photographs' own."""
 SURE = 0.5
@@ -108,7 +109,7 @@ class Appearance:
         if looked and not _shows_enough(list(looked.values())):
             return False
         if not self.active and self.mode == "auto" and len(self.maps) > ASKED_FOR_SPREAD:
-            asked = evenly(len(self.maps), ASKED_FOR_SPREAD)
+            asked = scattered(len(self.maps), ASKED_FOR_SPREAD)
             if common_spread(np.array([halves_of(*seen(i)) for i in asked])) < SPREAD / 2:
                 self.decided = True
                 return False
@@ -181,6 +182,15 @@ class Appearance:
         self.rounds, self.decided = int(state["rounds"]), bool(state["decided"])
         if int(state["active"]):
             self._use(maps)
+
+
+def scattered(n: int, most: int) -> list[int]:
+    """``most`` of n >= ``most`` places in order, one of each ``most``-th part: where in it the golden ratio's multiples say.
+
+    Places at one distance would all be of one exposure where these take turns: brackets, or two cameras side by side.
+    """
+    k, parts = np.arange(most), np.arange(most + 1) * n // most
+    return (parts[:-1] + (k * (math.sqrt(5) - 1) / 2 % 1 * np.diff(parts)).astype(int)).tolist()
 
 
 def centred(maps: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from nerfvol.measure.colour_fit import IDENTITY, apply_map, compose, exposure, f
 from nerfvol.native import native
 from nerfvol.starts.exposures import Exposures
 from nerfvol.training import begin
-from nerfvol.training.appearance import ASKED_FOR_SPREAD, FIRST_ASKED, MOMENTS, SPREAD, Appearance, centred
+from nerfvol.training.appearance import ASKED_FOR_SPREAD, FIRST_ASKED, MOMENTS, SPREAD, Appearance, centred, scattered
 from tests.fixtures.rooms import draw, facing_cameras, trace_planes, write_photographs
 from tests.fixtures.runs import metrics_of, settings, start
 
@@ -122,6 +122,18 @@ def test_some_of_many_photographs_tell_that_exposures_are_even(spread, asked):
     used = appearance.fit(lambda i: drawn.add(i) or clear(i), MOMENTS[0])
     assert len(drawn) >= asked if asked == 100 else len(drawn) <= asked + FIRST_ASKED
     assert used == (spread > SPREAD) and appearance.decided
+
+
+@pytest.mark.parametrize("n, turns", [(n, turns) for turns in (2, 3, 5) for n in (25, 47, 70, 93, 116, 139, 200)])
+def test_exposures_that_take_turns_are_seen_by_some(n, turns):
+    """Brackets, or two cameras side by side: every 2nd to 5th photograph, however many there are."""
+    gains = 1 + 0.5 * (np.arange(n) % turns) / turns
+    chosen = scattered(n, ASKED_FOR_SPREAD)
+    assert len(set(chosen)) == ASKED_FOR_SPREAD and chosen == sorted(chosen) and 0 <= chosen[0] and chosen[-1] < n
+    assert np.std(gains[chosen]) > 0.8 * np.std(gains)
+    if n == 70:
+        appearance = Appearance(n)
+        assert appearance.fit(seen_with(gains, np.random.default_rng(0).uniform(0, 0.7, (20, 30, 3))), MOMENTS[0])
 
 
 def test_uneven_photographs_come_to_one_exposure():
