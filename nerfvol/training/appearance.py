@@ -109,8 +109,11 @@ class Appearance:
         if looked and not _shows_enough(list(looked.values())):
             return False
         if not self.active and self.mode == "auto" and len(self.maps) > ASKED_FOR_SPREAD:
-            asked = scattered(len(self.maps), ASKED_FOR_SPREAD)
-            if common_spread(np.array([halves_of(*seen(i)) for i in asked])) < SPREAD / 2:
+            asked = map(seen, scattered(len(self.maps), ASKED_FOR_SPREAD))  # one in memory at a time
+            shares, sides = zip(*((_share_shown(look), halves_of(*look)) for look in asked), strict=True)
+            if np.median(shares) < LEAST_SHOWN:
+                return False
+            if common_spread(np.array(sides)) < SPREAD / 2:
                 self.decided = True
                 return False
         fitted, halves, explained = [], [], []
@@ -201,7 +204,12 @@ def centred(maps: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _shows_enough(looked: Sequence[Look]) -> bool:
     """Whether the model shows enough of these views for their exposures to be asked for."""
-    return bool(np.median([share_explained(fit_colour_map(b, a, w), b, a, w) for a, b, w in looked]) >= LEAST_SHOWN)
+    return bool(np.median([_share_shown(look) for look in looked]) >= LEAST_SHOWN)
+
+
+def _share_shown(look: Look) -> float:
+    photograph, shown, weight = look
+    return share_explained(fit_colour_map(shown, photograph, weight), shown, photograph, weight)
 
 
 def halves_of(

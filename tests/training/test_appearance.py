@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from nerfvol.cameras.camera import Intrinsics
+from nerfvol.datasets.dataset import evenly
 from nerfvol.measure.colour_fit import IDENTITY, apply_map, compose, exposure, fit_colour_map, inverse
 from nerfvol.native import native
 from nerfvol.starts.exposures import Exposures
@@ -122,6 +123,15 @@ def test_some_of_many_photographs_tell_that_exposures_are_even(spread, asked):
     used = appearance.fit(lambda i: drawn.add(i) or clear(i), MOMENTS[0])
     assert len(drawn) >= asked if asked == 100 else len(drawn) <= asked + FIRST_ASKED
     assert used == (spread > SPREAD) and appearance.decided
+
+
+def test_photographs_that_show_too_little_do_not_tell_that_exposures_are_even():
+    """Though the first that are asked show enough; they are asked again."""
+    clear = seen_with(np.ones(100), np.random.default_rng(0).uniform(0, 0.7, (20, 30, 3)))
+    fog, shown = np.full((20, 30, 3), 0.4), evenly(100, FIRST_ASKED)
+    appearance = Appearance(100)
+    assert not appearance.fit(lambda i: clear(i) if i in shown else (clear(i)[0], fog, clear(i)[2]), MOMENTS[0])
+    assert not appearance.decided and appearance.may_change
 
 
 @pytest.mark.parametrize("n, turns", [(n, turns) for turns in (2, 3, 5) for n in (25, 47, 70, 93, 116, 139, 200)])
