@@ -22,7 +22,7 @@ class SplatConfig(Checked):
     max_splats: Annotated[int, within(1, 1 << 26)] | None = None
     """Most Gaussians. None: from the time (or steps) there is, see splat_schedule."""
     sh_degree: Annotated[int, within(0, 3)] | None = None
-    """Spherical harmonics of the colours: 0 to 3. None: 1 in photographs, 2 for objects, 0 for those that few views show
+    """Spherical harmonics of the colours: 0 to 3. None: 1 in photographs, 2 for objects, 1 for those that few views show
     (field.few_views)."""
     two_backgrounds: bool | None = None
     """Cut-out pictures are seen before their background and the colour farthest from it in turn, so that what has the
@@ -75,5 +75,5 @@ OBJECTS: dict[str, Any] = {
     "ssim": 0.02, "two_backgrounds": False,
 }  # fmt: skip
 """Settings of splats where nothing else is said."""
-FEW_VIEWS: dict[str, Any] = {"sh_degree": 0, "two_backgrounds": True}
+FEW_VIEWS: dict[str, Any] = {"sh_degree": 1, "two_backgrounds": True}
 """... and of an object that few views show (docs/experiments.md)."""

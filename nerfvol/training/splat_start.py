@@ -76,11 +76,13 @@ def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
             return saved_schedule(saved)
     left = run.seconds_left()
     share = start_share(run.data.training.scene) if config.representation == "octree" else 1.0
-    if left is not None and config.representation == "splats" and config.init == "mlp":  # a field comes first
+    from_field = config.representation == "splats" and config.init == "mlp"
+    if from_field and left is not None:
         left -= min(config.field.time_budget, FIELD_SHARE * left)
     seconds = settings_of(config).steps * SECONDS_PER_STEP if left is None else share * left
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
-    return make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
+    schedule = make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
+    return schedule.of_surfaces() if from_field else schedule
 
 
 @contextlib.contextmanager

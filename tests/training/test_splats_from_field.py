@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from nerfvol.config.training import SHORT_RUN, Config
+from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import EmptyModel
 from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
-from nerfvol.training import memory, octree_start, session, train
+from nerfvol.training import memory, octree_start, session, splat_schedule, train
+from nerfvol.training.splat_start import make_schedule_of
 from tests.fixtures.runs import TINY, metrics_of, run_of, settings, start
 
 pytestmark = pytest.mark.skipif(native() is None, reason="the reference path takes minutes; it has a test of its own")
@@ -64,7 +66,7 @@ def whole(tmp_path_factory, tiny_scene):
 
 
 def test_what_is_said_and_left(whole):
-    run, said, _ = whole
+    run, said, checkpoints = whole
     told = "\n".join(said)
     assert "start: a field, then discs on the octree that it is distilled to, for there are only" in told
     assert "sizes of them before two backgrounds" in told and "to distil the field" in told
@@ -73,6 +75,15 @@ def test_what_is_said_and_left(whole):
     assert metrics["steps"] == {"field": 60, "splats": 12}
     assert list(metrics["results"]) == ["field", "distilled", "fine_tuned"]
     assert metrics["results"]["fine_tuned"]["leaves"] is None
+    assert load_checkpoint(checkpoints["splats", 12])["trainer"]["factors"] == [1]  # pictures of 40 pixels
+
+
+def test_the_schedule_begins_with_a_half(tmp_path, tiny_scene, monkeypatch):
+    monkeypatch.setattr(splat_schedule, "COARSEST_SIDE", 10)
+    for init, factors in (("auto", (2, 1)), ("hull", (4, 2, 1))):
+        (tmp_path / init).mkdir()
+        run = run_of(splat_settings(tiny_scene, tmp_path / init, init=init))
+        assert make_schedule_of(run, Photographs(run.data.training)).factors == factors
 
 
 @pytest.mark.parametrize("phase, step", [("field", 59), ("splats", 1), ("splats", 7)])
@@ -107,7 +118,8 @@ def test_memory_counts_the_field(tmp_path, tiny_scene):
     said: list[str] = []
     run.say = said.append
     training, kept = run.data.training, run.data.held_out_bytes
-    train.begin_splats(run)
+    with run:
+        train.begin_splats(run)
     announced = next(line for line in said if "memory: " in line)
     field = memory.distillation_bytes(training, 2, kept)
     assert f"before that {memory.gib(field)[:3]}" in announced
