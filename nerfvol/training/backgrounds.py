@@ -26,6 +26,6 @@ def second_background(dataset: Dataset, background: Sequence[float], wanted: boo
     return farthest(background) if wanted and has_silhouettes(dataset, all_of_them=True) else None
 
 
-def is_second(second: Colour | None, step: int) -> bool:
-    """Whether step ``step`` has the second colour behind."""
-    return second is not None and step % 2 == 1
+def is_second(second: Colour | None, step: int, every: int = 2) -> bool:
+    """Whether step ``step`` has the second colour behind, as one of ``every`` steps has."""
+    return second is not None and step % every == 1

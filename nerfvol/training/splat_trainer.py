@@ -36,6 +36,9 @@ VIEWS, SPLITS = 3, 4
 NEAR_SHARE = 0.02
 """Of the subject's distance: what is nearer to a camera is not drawn."""
 SECONDS_TO_WRITE = 0.3
+SECOND_EVERY = 4
+"""Steps of which one is before the second background: a whole view in each tells of all that is open in it, and what is
+scored are pictures before the first (half of the steps cost 0.1 to 0.8 dB of these, docs/experiments.md)."""
 MOTION_PIXELS, MOTION_DECAY = 0.4, 0.1
 """Pixels of the present pictures by which a refined camera moves a visit, and the factor at the end: small pictures first,
 which see far, then fine ones."""
@@ -156,7 +159,7 @@ class SplatTrainer:
         if self.appearance.due(progress):
             self.fit_appearance(progress)
         index = self._next_view()
-        second = is_second(self.photographs.second, self.steps_done)
+        second = is_second(self.photographs.second, self.steps_done, SECOND_EVERY)
         view = self.photographs.view(index, self.schedule.factors[self.stage], second)
         near = NEAR_SHARE * self.subject_distance
         report = splat_ops.train_step(

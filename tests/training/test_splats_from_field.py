@@ -13,6 +13,8 @@ from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
 from nerfvol.training import memory, octree_start, session, splat_schedule, train
+from nerfvol.training.clock import Clock
+from nerfvol.training.prepare import load_data
 from nerfvol.training.splat_start import make_schedule_of
 from tests.fixtures.runs import TINY, metrics_of, run_of, settings, start
 
@@ -46,6 +48,14 @@ def test_a_resumed_run_keeps_its_start(phases, expected):
     for budget in (None, 5.0, 60.0) if phases else (None,):
         config = Config(representation="splats", time_budget=budget)
         assert config.for_views(8, SceneBounds(BOX, None, True), begun=phases).init == expected
+
+
+def test_a_run_whose_field_came_out_empty_goes_on_without(tmp_path, tiny_scene):
+    config = splat_settings(tiny_scene, tmp_path)
+    data = load_data(config)
+    for results, init in (({}, "auto"), ({"distilled": {}}, "mlp")):
+        saved = {"phase": "splats", "log_bytes": 0, "results": results, "steps": {"field": 60, "splats": 1}}
+        assert session.Run(config, data, Clock(0.0, 0.0), saved).config.init == init
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +103,10 @@ def test_resumed_anywhere_the_splats_are_the_same(whole, tmp_path, tiny_scene, p
     out.mkdir()
     shutil.copy(run / run_folder.CONFIG, out)
     save_checkpoint(out / run_folder.CHECKPOINT, load_checkpoint(checkpoints[phase, step]))
-    again = start(splat_settings(tiny_scene, out, resume=True))
+    said: list[str] = []
+    again = start(splat_settings(tiny_scene, out, resume=True), say=said.append)
+    assert f"resumed at step {step} of the {phase}" in said
+    assert sum("to distil the field" in line for line in said) == (phase == "field")
     assert (again / run_folder.SPLATS).read_bytes() == (run / run_folder.SPLATS).read_bytes()
 
 
