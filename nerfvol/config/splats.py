@@ -25,8 +25,8 @@ class SplatConfig(Checked):
     """Spherical harmonics of the colours: 0 to 3. None: 1 in photographs, 2 for objects, 1 for those that few views show
     (field.few_views)."""
     two_backgrounds: bool | None = None
-    """Cut-out pictures are seen before their background and the colour farthest from it in turn, so that what has the
-    background's colour is not for nothing. None: where few views show an object (field.few_views)."""
+    """Cut-out pictures are seen before the colour farthest from their background as well, in one step of four, so that what
+    has the background's colour is not for nothing. None: yes, where an object's pictures are all cut out."""
     mode: Literal["mip", "plain"] = "mip"
     """How what is smaller than a pixel is drawn: "mip" holds its light at every size, "plain" is for viewers that cannot."""
     rate_means: Rate | None = None
@@ -72,8 +72,8 @@ PHOTOGRAPHS: dict[str, Any] = {
 }  # fmt: skip
 OBJECTS: dict[str, Any] = {
     "sh_degree": 2, "rate_means": 0.25, "rate_scales": 0.16, "rate_decay": 0.15, "rate_decay_means": 0.06, "beta2": 0.97,
-    "ssim": 0.02, "two_backgrounds": False,
+    "ssim": 0.02, "two_backgrounds": True,
 }  # fmt: skip
 """Settings of splats where nothing else is said."""
-FEW_VIEWS: dict[str, Any] = {"sh_degree": 1, "two_backgrounds": True}
+FEW_VIEWS: dict[str, Any] = {"sh_degree": 1}
 """... and of an object that few views show (docs/experiments.md)."""

@@ -14,6 +14,7 @@ from nerfvol.datasets.images import composite_average
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.starts.cloud import splats_of_cloud
 from nerfvol.starts.random import random_points
+from nerfvol.training import convert
 from nerfvol.training.backgrounds import farthest, second_background
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_phase import domain_of
@@ -94,10 +95,19 @@ def test_runs_of_few_views_have_two(white_ball):
         config = Config(data="d", out="o", octree=dataclasses.replace(OctreeConfig(), two_backgrounds=said))
         settled = config.for_views(n, scene).for_scene(scene)
         assert settled.octree.two_backgrounds is has
-        splats = dataclasses.replace(SplatConfig(), two_backgrounds=said)
-        for representation in ("splats", "octree"):  # or what an octree may begin with
-            config = Config(data="d", out="o", representation=representation, splats=splats)
-            assert config.for_views(n, scene).for_scene(scene).splats.two_backgrounds is has
+
+
+@pytest.mark.parametrize("representation", ["splats", "octree"])  # which may begin with splats
+@pytest.mark.parametrize("n, degree", [(16, 1), (17, 2)])
+def test_splats_of_all_cut_out_objects_have_two(white_ball, representation, n, degree):
+    """Where nobody said; those of few views have little view dependence."""
+    photographs = dataclasses.replace(white_ball.scene, background_cube=16 * white_ball.scene.aabb)
+    for said, sh in ((None, None), (False, 0), (True, 3)):
+        splats = SplatConfig(two_backgrounds=said, sh_degree=sh)
+        config = Config(data="d", out="o", representation=representation, splats=splats)
+        settled = config.for_views(n, white_ball.scene).for_scene(white_ball.scene).splats
+        assert settled.two_backgrounds is (said is not False) and settled.sh_degree == (degree if sh is None else sh)
+        assert config.for_views(n, photographs).for_scene(photographs).splats.two_backgrounds is (said is True)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
@@ -155,3 +165,13 @@ def test_the_same_splats_resumed_after_an_odd_step(compiled, white_ball):
     for k in range(3, 6):
         second.step(k / 6)
     assert whole.state.params.tobytes() == second.state.params.tobytes()
+
+
+@pytest.mark.parametrize("few, said, degree", [(16, None, 1), (4, None, 2), (16, False, 1)])
+def test_splats_that_a_conversion_trains_have_two(compiled, white_ball, monkeypatch, few, said, degree):
+    seen: list[SplatTrainer] = []
+    monkeypatch.setattr(convert, "_run", lambda phase, *_: seen.append(phase))
+    config = Config(data="d", out="o", field=FieldConfig(few_views=few), splats=SplatConfig(two_backgrounds=said))
+    splats = splat_trainer(white_ball, False).state.splats()
+    convert.tuned_splats(splats, white_ball, WHITE, config)
+    assert seen[0].photographs.second == (BLACK if said is None else None) and seen[0].config.sh_degree == degree
