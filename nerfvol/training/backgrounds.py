@@ -1,7 +1,8 @@
-"""What few cut-out pictures are seen before while a model is trained: their background and the colour farthest from it.
+"""What cut-out pictures are seen before while a model is trained: their background and the colour farthest from it.
 
-Before one colour whatever has that colour costs nothing, in front of the object or beside it, and few views do not show that it
-is there. Before two in turn opacity is the silhouette's: what is half transparent is wrong before one of them.
+Splats have both of all objects, fields and octrees of those that few views show. Before one colour whatever has that colour
+costs nothing, in front of the object or beside it, and views do not show that it is there, few of them least of all. Before two
+in turn opacity is the silhouette's: what is half transparent is wrong before one of them.
 """
 
 from __future__ import annotations

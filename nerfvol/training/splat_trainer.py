@@ -37,8 +37,8 @@ NEAR_SHARE = 0.02
 """Of the subject's distance: what is nearer to a camera is not drawn."""
 SECONDS_TO_WRITE = 0.3
 SECOND_EVERY = 4
-"""Steps of which one is before the second background: a whole view in each tells of all that is open in it, and what is
-scored are pictures before the first (half of the steps cost 0.1 to 0.8 dB of these, docs/experiments.md)."""
+"""Steps of which one is before the second background: a whole view tells of all that is open in it, and pictures before the
+first are what most people look at (with every second step these lose 0.1 to 0.8 dB more, docs/experiments.md)."""
 MOTION_PIXELS, MOTION_DECAY = 0.4, 0.1
 """Pixels of the present pictures by which a refined camera moves a visit, and the factor at the end: small pictures first,
 which see far, then fine ones."""
