@@ -287,7 +287,7 @@ MUTANTS = (
     M("nerfvol/training/convert.py", "finest_level(scene, cameras) + scene.is_unbounded, most", "finest_level(scene, cameras), most", "training/test_photographs_from_splats.py", "photographs' surfaces a level too coarse"),
     M("nerfvol/training/memory/octree.py", "wanted = leaves if leaves and not grows else max(wanted, leaves)", "pass", "training/test_photographs_from_splats.py", "leaves that splats become are not announced"),
     M("nerfvol/training/octree_start.py", "        asked.go_on_from(appearance)", "        pass", "training/test_photographs_from_splats.py", "colour maps of splats are lost"),
-    M("nerfvol/training/octree_start.py", "        run.with_low_density()\n        run.say(f\"start: low density, for there", "        run.say(f\"start: low density, for there", "training/test_photographs_from_splats.py", "low density with the settings of surfaces"),
+    M("nerfvol/training/octree_start.py", "        run.without_first()\n        run.say(f\"start: low density, for there", "        run.say(f\"start: low density, for there", "training/test_photographs_from_splats.py", "low density with the settings of surfaces"),
     M("nerfvol/training/finishing.py", "sure = writing + data.reading + table", "sure = table", "training/test_budget.py", "writing and reading are not kept of a budget"),
     M("nerfvol/training/finishing.py", "        table += data.loading", "        pass", "training/test_budget.py", "released photographs are read in no time"),
     M("nerfvol/training/session.py", "            begun -= {first for first, became in BECAME.items() if became not in self.results}", "            pass", "training/test_octree_start.py", "splats that became no octree settle a resumed run"),

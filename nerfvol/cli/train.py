@@ -33,8 +33,9 @@ def arguments(p: argparse.ArgumentParser) -> None:
     p.add_argument("--init", metavar="START", help="where it starts. octree: direct (low density everywhere), mlp (a small "
                    "field, trained first and distilled, which auto takes for objects of few views or with a long time "
                    "budget) or splats (trained first, too, which auto takes for photographs with a time budget, and "
-                   "for other objects where it is short); splats: points (of a "
-                   "COLMAP model), sweep (of planes through the photographs), points+sweep, "
+                   "for other objects where it is short); splats: mlp (discs on what a small field is "
+                   "distilled to, which auto takes for objects of few views), points (of a COLMAP "
+                   "model), sweep (of planes through the photographs), points+sweep, "
                    "hull (of the silhouettes of a cut-out object), random, or a file of splats or an "
                    "octree (default: auto)")  # fmt: skip
     p.add_argument("--time-budget", metavar="TIME", help="wall-clock time for everything, such as 120s or 5m; none: "

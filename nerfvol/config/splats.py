@@ -22,7 +22,11 @@ class SplatConfig(Checked):
     max_splats: Annotated[int, within(1, 1 << 26)] | None = None
     """Most Gaussians. None: from the time (or steps) there is, see splat_schedule."""
     sh_degree: Annotated[int, within(0, 3)] | None = None
-    """Spherical harmonics of the colours: 0 to 3. None: 1 in photographs, 2 for objects."""
+    """Spherical harmonics of the colours: 0 to 3. None: 1 in photographs, 2 for objects, 1 for those that few views show
+    (field.few_views)."""
+    two_backgrounds: bool | None = None
+    """Cut-out pictures are seen before the colour farthest from their background as well, in one step of four, so that what
+    has the background's colour is not for nothing. None: yes, where an object's pictures are all cut out."""
     mode: Literal["mip", "plain"] = "mip"
     """How what is smaller than a pixel is drawn: "mip" holds its light at every size, "plain" is for viewers that cannot."""
     rate_means: Rate | None = None
@@ -64,10 +68,12 @@ class SplatConfig(Checked):
 
 PHOTOGRAPHS: dict[str, Any] = {
     "sh_degree": 1, "rate_means": 0.2, "rate_scales": 0.12, "rate_decay": 0.2, "rate_decay_means": 0.1, "beta2": 0.98,
-    "ssim": 0.03,
+    "ssim": 0.03, "two_backgrounds": False,
 }  # fmt: skip
 OBJECTS: dict[str, Any] = {
     "sh_degree": 2, "rate_means": 0.25, "rate_scales": 0.16, "rate_decay": 0.15, "rate_decay_means": 0.06, "beta2": 0.97,
-    "ssim": 0.02,
+    "ssim": 0.02, "two_backgrounds": True,
 }  # fmt: skip
 """Settings of splats where nothing else is said."""
+FEW_VIEWS: dict[str, Any] = {"sh_degree": 1}
+"""... and of an object that few views show (docs/experiments.md)."""

@@ -19,6 +19,7 @@ from nerfvol.config.octree import FEW_VIEWS, OctreeConfig
 from nerfvol.config.octree import SceneChoices as SceneChoices
 from nerfvol.config.octree import finest_level as finest_level
 from nerfvol.config.parsers import Colour, Seconds, box, seconds
+from nerfvol.config.splats import FEW_VIEWS as FEW_VIEWS_OF_SPLATS
 from nerfvol.config.splats import SplatConfig
 from nerfvol.config.values import Checked, Count, filled, within
 from nerfvol.defaults import WHITE
@@ -43,7 +44,7 @@ LARGE_TABLES: dict[str, Any] = {"hash_log2_table": 19, "hash_max": 512}
 """... these: a step takes 1.4 times as long, and they hold details that a longer run has the time to learn (lego 400x400:
 28.83 and 28.65 dB after 30 s, 29.49 and 29.63 after 60; docs/experiments.md)."""
 OCTREE_STARTS = ("direct", "mlp", "splats")
-SPLAT_STARTS = ("points", "sweep", "points+sweep", "hull", "random")
+SPLAT_STARTS = ("mlp", "points", "sweep", "points+sweep", "hull", "random")
 """Besides a file of splats or of an octree."""
 
 
@@ -66,8 +67,9 @@ class Config(Checked):
     views or a long time budget), "splats", which are trained first, too, and whose surfaces it begins with (auto: of
     photographs with a time budget, and of other objects where it is short), or "direct", low density everywhere (auto: of all
     else, and of what may be a medium). A field: auto.
-    Splats: "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "random", or a file or run
-    of splats or of an octree (auto: what there is)."""
+    Splats: "mlp", discs on the octree of a small field that is trained first (auto: of objects with few training views),
+    "points" of a COLMAP model, "sweep" of planes through the photographs, "points+sweep", "hull" of silhouettes, "random", or a
+    file or run of splats or of an octree (auto: what there is)."""
     time_budget: Annotated[float | None, seconds] = None
     """Seconds of wall clock for everything, from the start of the process; None: the sections' numbers of steps."""
     scene: Literal["auto", "object", "surroundings", "room", "forward"] = "auto"
@@ -126,7 +128,7 @@ class Config(Checked):
         if self.resume:
             return
         known = {"octree": OCTREE_STARTS, "splats": SPLAT_STARTS, "field": (), "medium": ()}
-        names = known.get(self.representation, OCTREE_STARTS + SPLAT_STARTS)
+        names = known.get(self.representation, tuple(dict.fromkeys(OCTREE_STARTS + SPLAT_STARTS)))
         is_file = self.representation not in ("octree", "field", "medium") and Path(self.init).exists()
         if self.init != "auto" and self.init not in names and not is_file:
             of = "" if self.representation == "auto" else f" for {self.representation}"
@@ -161,20 +163,23 @@ class Config(Checked):
     def for_views(
         self, n: int, scene: SceneBounds, is_simulated: bool = False, begun: Collection[str] = (), side: int = 0
     ) -> Config:
-        """The same with the octree's start, smoothness and backgrounds for ``n`` training views, where nobody chose them: of an
-        object that few views show a field leaves less open than low density does (docs/experiments.md), where there is time for
-        one; the others in any case. Of one that many views show, and in photographs, splats are there sooner than fog has
-        become surfaces, and where there is more time a field; photographs keep haze that fog leaves for good.
+        """The same with the start, smoothness and backgrounds of an octree or splats for ``n`` training views, where nobody
+        chose them: of an object that few views show a field leaves less open than low density or a hull does
+        (docs/experiments.md), where there is time for one; the others in any case. An octree of one that many views show, and
+        of photographs: splats are there sooner than fog has become surfaces, and where there is more time a field; photographs
+        keep haze that fog leaves for good.
 
         is_simulated: the data may show a medium, whose density counts: no splats, which are surfaces. begun: the phases that a
         resumed run has begun: another time budget, which it may have, must not choose another start. side: of the pictures,
         the shorter one, pixels.
         """
-        if self._suited(scene) != "octree":
+        suited, budget = self._suited(scene), self.time_budget
+        few = self._are_few(n, scene)
+        if suited not in ("octree", "splats") or suited == "splats" and not few:
             return self
-        few, budget = self._are_few(n, scene), self.time_budget
         if begun:
-            start = "mlp" if "field" in begun else "splats" if "splats" in begun else "auto"
+            as_splats = suited == "octree" and "splats" in begun
+            start = "mlp" if "field" in begun else "splats" if as_splats else "auto"
         elif few:
             start = "auto" if budget is not None and budget <= SHORT_RUN else "mlp"
         else:
@@ -186,12 +191,13 @@ class Config(Checked):
         return dataclasses.replace(self, init=init).for_few_views(n, scene)
 
     def for_few_views(self, n: int, scene: SceneBounds) -> Config:
-        """The same with what an octree is given of an object that ``n`` training views show, where these are few and nobody
-        chose it: smoothness, backgrounds and the level at which a field is distilled, whatever the octree begins with."""
+        """The same with what an octree or splats are given of an object that ``n`` training views show, where these are few and
+        nobody chose it: smoothness, backgrounds and the level at which a field is distilled, whatever they begin with."""
         if not self._are_few(n, scene):
             return self
         octree, distill = filled(self.octree, FEW_VIEWS), filled(self.distill, FEW_VIEWS_DISTILLED)
-        return dataclasses.replace(self, octree=octree, distill=distill)
+        splats = filled(self.splats, FEW_VIEWS_OF_SPLATS)
+        return dataclasses.replace(self, octree=octree, distill=distill, splats=splats)
 
     def _are_few(self, n: int, scene: SceneBounds) -> bool:
         return n <= self.field.few_views and not scene.is_unbounded

@@ -53,6 +53,8 @@ class Photographs:
     ``most_bytes`` bounds what is kept next to the dataset's images: what comes when it is full is made again whenever it is
     asked for, the same bits. Views are visited in an order of chance, each once in an epoch: no rule of what to throw out
     would hit more often than keeping those that came first.
+
+    ``second``: another background (3,) in [0, 1], before which each view can be had as well; None: there is none.
     """
 
     def __init__(
@@ -63,10 +65,11 @@ class Photographs:
         max_angle: float = MAX_ANGLE,
         threads: int | None = None,
         most_bytes: int | None = None,
+        second: tuple[float, float, float] | None = None,
     ) -> None:
         """``alpha``: images with transparency are composited over ``background`` (objects), or it is the loss's weight
         (masked photographs). ``max_angle``: radians to each side of the axis, the widest a canvas is. ``most_bytes``: None for
-        no bound.
+        no bound. ``second``: the second background of composited images.
 
         Raises:
             InputError: the lens of a view cannot be undone.
@@ -77,23 +80,26 @@ class Photographs:
         canvases = {lens: canvas_of(lens, max_angle) for lens in {c.intrinsics for c in dataset.cameras}}
         self.cameras = [c.through(canvases[c.intrinsics].camera) for c in dataset.cameras]
         grids = {lens: source_grid(canvas, lens) for lens, canvas in canvases.items() if not is_pinhole(lens)}
-        over = background if alpha == "background" else None
+        self.second = second
+        colours = [background] if second is None else [background, second]
+        images: list[UInt8] = list(dataset.images) * len(colours)
 
-        images: list[UInt8] = list(dataset.images)
-
-        def make(i: int) -> UInt8:
+        def make(key: int) -> UInt8:
+            which, i = divmod(key, len(dataset))
             lens, image = dataset.cameras[i].intrinsics, images[i]
-            if over is not None and image.shape[2] == 4:
-                image = composite_average(image, over, 1)
+            if alpha == "background" and image.shape[2] == 4:
+                image = composite_average(image, colours[which], 1)
             if (mask := dataset.mask(i)) is not None:
                 own = image[..., 3] if image.shape[2] == 4 else 255
                 image = np.concatenate([image[..., :3], np.minimum(mask, own)[..., None]], axis=2)
             return undistorted(image, canvases[lens], *grids[lens]) if lens in grids else image
 
         self._make_source, self._images, self._most, self._lock = make, images, most_bytes, threading.Lock()
-        self._sources: list[UInt8 | None] = [None] * len(dataset)
+        self._sources: list[UInt8 | None] = [None] * len(
+            images
+        )  # those before the second background come after the others
         self._bytes, self._full = 0, False
-        map_threads(lambda i: None if self._full else self._source(i), range(len(dataset)), self._threads)
+        map_threads(lambda key: None if self._full else self._source(key), range(len(images)), self._threads)
         wide = [c.intrinsics for c in dataset.cameras if canvases[c.intrinsics].cropped]
         if wide:
             self.messages.append(
@@ -121,31 +127,33 @@ class Photographs:
         """The factors of which images are held now."""
         return {factor for factor, views in self._levels.items() if views}
 
-    def view(self, i: int, factor: int) -> TrainingView:
-        """View i at 1 / factor of its size, made where it is not kept; a power of two up to 64."""
+    def view(self, i: int, factor: int, second: bool = False) -> TrainingView:
+        """View i at 1 / factor of its size, a power of two up to 64, made where it is not kept; ``second``: before the second
+        background."""
         check_factor(factor)
-        kept = self._levels.setdefault(factor, {}).get(i)
+        key = i + len(self) * second
+        kept = self._levels.setdefault(factor, {}).get(key)
         if kept is not None:
             return kept
-        source = self._source(i)
+        source = self._source(key)
         view = self._make(i, factor, source)
-        own = factor == 1 and source is self._sources[i] and source is not self._images[i]
+        own = factor == 1 and source is self._sources[key] and source is not self._images[key]
         if (
-            view.image is self._sources[i]
-            or (own and self._in_place(i, source, view.image))
+            view.image is self._sources[key]
+            or (own and self._in_place(key, source, view.image))
             or self._room(view.image.nbytes)
         ):
-            self._levels[factor][i] = view
+            self._levels[factor][key] = view
         return view
 
     def level(self, factor: int) -> list[TrainingView]:
-        """All views at 1 / factor of their size."""
+        """All views at 1 / factor of their size, before the first background."""
         return map_threads(lambda i: self.view(i, factor), range(len(self)), self._threads)
 
     def drop(self, factor: int) -> None:
         """Release a level's images; full-size canvases stay, since the others are made from them."""
-        for i, view in self._levels.pop(factor, {}).items():
-            if view.image is not self._sources[i]:
+        for key, view in self._levels.pop(factor, {}).items():
+            if view.image is not self._sources[key]:
                 self._bytes -= view.image.nbytes
 
     def _room(self, more: int) -> bool:
@@ -156,20 +164,20 @@ class Photographs:
             self._full |= not fits
         return fits
 
-    def _source(self, i: int) -> UInt8:
-        """Photograph i at its full size, what is made of the dataset's image kept where there is room."""
-        if (kept := self._sources[i]) is not None:
+    def _source(self, key: int) -> UInt8:
+        """A photograph at its full size, what is made of the dataset's image kept where there is room."""
+        if (kept := self._sources[key]) is not None:
             return kept
-        source = self._make_source(i)
-        if source is self._images[i] or self._room(source.nbytes):
-            self._sources[i] = source
+        source = self._make_source(key)
+        if source is self._images[key] or self._room(source.nbytes):
+            self._sources[key] = source
         return source
 
-    def _in_place(self, i: int, source: UInt8, padded: UInt8) -> bool:
+    def _in_place(self, key: int, source: UInt8, padded: UInt8) -> bool:
         """Whether the padded copy takes the place of the source that it was made from, and of its bytes."""
         if not self._room(padded.nbytes - source.nbytes):
             return False
-        self._sources[i] = padded
+        self._sources[key] = padded
         return True
 
     def _make(self, i: int, factor: int, source: UInt8) -> TrainingView:

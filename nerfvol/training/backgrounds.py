@@ -1,7 +1,8 @@
-"""What few cut-out pictures are seen before while a model is trained: their background and the colour farthest from it.
+"""What cut-out pictures are seen before while a model is trained: their background and the colour farthest from it.
 
-Before one colour whatever has that colour costs nothing, in front of the object or beside it, and few views do not show that it
-is there. Before two in turn opacity is the silhouette's: what is half transparent is wrong before one of them.
+Splats have both of all objects, fields and octrees of those that few views show. Before one colour whatever has that colour
+costs nothing, in front of the object or beside it, and views do not show that it is there, few of them least of all. Before two
+in turn opacity is the silhouette's: what is half transparent is wrong before one of them.
 """
 
 from __future__ import annotations
@@ -26,6 +27,6 @@ def second_background(dataset: Dataset, background: Sequence[float], wanted: boo
     return farthest(background) if wanted and has_silhouettes(dataset, all_of_them=True) else None
 
 
-def is_second(second: Colour | None, step: int) -> bool:
-    """Whether step ``step`` has the second colour behind."""
-    return second is not None and step % 2 == 1
+def is_second(second: Colour | None, step: int, every: int = 2) -> bool:
+    """Whether step ``step`` has the second colour behind, as one of ``every`` steps has."""
+    return second is not None and step % every == 1

@@ -12,10 +12,18 @@ from nerfvol.native import need_torch
 from nerfvol.starts.exposures import measure_exposures
 from nerfvol.starts.fog import low_density_octree
 from nerfvol.training.appearance import Appearance
+from nerfvol.training.backgrounds import second_background
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.few_views import few_views
 from nerfvol.training.field_start import make_final_trainer
-from nerfvol.training.memory import OctreePlan, field_memory, medium_memory, photographs_bytes, splat_memory
+from nerfvol.training.memory import (
+    OctreePlan,
+    field_backgrounds,
+    field_memory,
+    medium_memory,
+    photographs_bytes,
+    splat_memory,
+)
 from nerfvol.training.octree_start import (
     Optimise,
     SplatPlan,
@@ -51,7 +59,7 @@ def begin_octree(run: Run, optimise: Optimise) -> OctreeTrainer:
         if splats is None or run.given.init != "auto" or run.phase == "splats":
             raise
         splats = None
-        run.with_low_density()
+        run.without_first()
         plan = _plan_of(run, None)  # or there is no memory for any
         run.say(f"start: low density, for with splats first {error}")
     announce(run, plan.sentence())
@@ -102,17 +110,24 @@ def begin_medium(run: Run) -> MediumTrainer:
     return MediumTrainer(dataset, lighting, config.medium, config.seed, run.background)
 
 
-def begin_splats(run: Run) -> SplatTrainer:
-    """The trainer of splats: from what suits the data, or what ``init`` asks for."""
+def begin_splats(run: Run, optimise: Optimise) -> SplatTrainer:
+    """The trainer of splats: from what suits the data, a field of few views first, trained by ``optimise``, or what ``init``
+    asks for."""
     from nerfvol.training.splat_start import make_schedule_of, start_splats
 
     config, dataset = run.config, run.data.training
-    photographs = Photographs(dataset, run.background, most_bytes=photographs_bytes())
+    second = second_background(dataset, run.background, bool(config.splats.two_backgrounds))
+    photographs = Photographs(dataset, run.background, most_bytes=photographs_bytes(), second=second)
     for message in photographs.messages:
         run.say(message)
-    schedule = make_schedule_of(run, photographs)
-    announce(run, splat_memory(dataset, photographs, schedule, config.splats, run.data.held_out_bytes))
-    splats, distance = start_splats(run, photographs, schedule.most)
+    schedule, kept = make_schedule_of(run, photographs), run.data.held_out_bytes
+    first = field_backgrounds(config, dataset) if config.init == "mlp" and run.phase != "splats" else 0
+    announce(run, splat_memory(dataset, photographs, schedule, config.splats, kept, first))
+    if config.init != run.given.init and (chosen := why_start(config, len(dataset))):
+        run.say(chosen)
+    octree = start_from_field(run, optimise) if first else None
+    splats, distance = start_splats(run, photographs, schedule.most, octree)
+    del octree
     return SplatTrainer(
         photographs, splats, config.splats, schedule, distance, run.background, config.seed, appearance_of(run, photographs),
         config.refine_poses,

@@ -1,6 +1,7 @@
 """What an octree begins with besides low density: a field or splats, which are trained first as a phase of the run.
 
-Both end as an octree and as rows among the run's results; a run that is resumed inside of either goes on there.
+Both end as an octree and as rows among the run's results; a run that is resumed inside of either goes on there. Splats of few
+views begin with a field's octree as well.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from nerfvol.machine import return_free_memory
 from nerfvol.measure.scores import MEANS, evaluate, score_views
 from nerfvol.octree.tree import Octree
 from nerfvol.training.appearance import MOMENTS, Appearance, small_picture
+from nerfvol.training.backgrounds import second_background
 from nerfvol.training.field_phase import level_in_time
 from nerfvol.training.field_start import make_field_trainer
 from nerfvol.training.memory import (
@@ -50,11 +52,15 @@ Optimise = Callable[[Run, Phase], None]
 
 
 def why_start(config: Config, n_views: int, photographs: bool = False) -> str | None:
-    """A sentence on the start that was chosen for ``n_views`` training views; None: low density, which needs none."""
+    """A sentence on the start that was chosen for ``n_views`` training views; None: low density, which needs none, or splats'
+    points, of which their start says more."""
     if config.init == "mlp":
         few = n_views <= config.field.few_views
         why = f"there are only {n_views} training views" if few else "there is time for one"
-        return f"start: a field, then the octree that it is distilled to, for {why}; --init direct overrules"
+        octree, instead = ("the octree that it is distilled to", "direct")
+        if config.representation == "splats":
+            octree, instead = f"discs on {octree}", "hull"
+        return f"start: a field, then {octree}, for {why}; --init {instead} overrules"
     if config.init == "splats":
         why = (
             "low density would leave haze in photographs" if photographs else f"{config.time_budget or 0:g} s are short"
@@ -66,7 +72,8 @@ def why_start(config: Config, n_views: int, photographs: bool = False) -> str | 
 def start_from_field(run: Run, optimise: Optimise) -> Octree | None:
     """Trains the field and distils it; the octree, and the scores of both among the run's results.
 
-    None, with a sentence, where nobody asked for a field and it came out empty: low density is left to begin with.
+    None, with a sentence, where nobody asked for a field and it came out empty: there is low density to begin with, or for
+    splats what suits the data.
 
     Raises:
         EmptyModel: a field was asked for, and there is nothing in it.
@@ -77,8 +84,9 @@ def start_from_field(run: Run, optimise: Optimise) -> Octree | None:
         if run.given.init != "auto":
             raise
         run.results.pop("field", None)
-        run.with_low_density()
-        run.say("start: low density, for the field came out empty; are the background and the scene bounds right?")
+        run.without_first()
+        instead = "low density" if run.config.representation == "octree" else "without a field"
+        run.say(f"start: {instead}, for the field came out empty; are the background and the scene bounds right?")
         return None
 
 
@@ -129,7 +137,7 @@ def planned_splats(run: Run) -> SplatPlan | None:
     except InputError as error:
         if run.given.init != "auto" or run.phase == "splats":
             raise
-        run.with_low_density()
+        run.without_first()
         run.say(f"start: low density, for there can be no splats first: {error}")
         return None
 
@@ -144,7 +152,8 @@ def prepare_splats(run: Run) -> SplatPlan:
     from nerfvol.training.splat_start import make_schedule_of
 
     dataset, settings, kept = run.data.training, run.config.splats, run.data.held_out_bytes
-    photographs = Photographs(dataset, run.background, most_bytes=photographs_bytes())
+    second = second_background(dataset, run.background, bool(settings.two_backgrounds))
+    photographs = Photographs(dataset, run.background, most_bytes=photographs_bytes(), second=second)
     for message in photographs.messages:
         run.say(message)
     schedule = make_schedule_of(run, photographs)
@@ -217,7 +226,7 @@ def start_from_splats(
     except InputError as error:
         if run.given.init != "auto":
             raise
-        run.with_low_density()
+        run.without_first()
         run.say(f"start: low density, for the splats became no octree: {error}")
         return None
     converted = OctreeModel(octree, run.metadata())

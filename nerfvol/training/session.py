@@ -64,8 +64,9 @@ class Run:
         self.folder = Path(config.out)
         self.checkpoint = self.folder / run_folder.CHECKPOINT
         begun = set(self.steps)
-        if self.phase == "octree":  # what became no octree left it to begin with low density
-            begun -= {first for first, became in BECAME.items() if became not in self.results}
+        if self.phase in ("octree", "splats"):  # what became no octree left them to begin with something else
+            lost = {first for first, became in BECAME.items() if became not in self.results}
+            begun -= lost - {self.phase}
         self.config = self._settled(begun)
         self.background: tuple[float, float, float] = self.config.background or WHITE
         self.clock, self.say = clock, say
@@ -95,9 +96,10 @@ class Run:
         suited = config.for_scene(scene).for_pictures(side)
         return suited.before(self.data.training.backdrop)
 
-    def with_low_density(self) -> None:
-        """What was to begin as splats or a field, and nobody asked for it, begins with low density: there can be none."""
-        self.config = self._settled(("octree",))
+    def without_first(self) -> None:
+        """What was to begin as splats or a field, and nobody asked for it, begins with something else, an octree with low
+        density: there can be none."""
+        self.config = self._settled((self.config.representation,))
 
     def enter(self, phase: Phase) -> None:
         """Begin the phase, or go on inside it where the checkpoint was written in it.

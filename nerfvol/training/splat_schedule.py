@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 SECONDS_PER_STEP = 1 / 80
@@ -52,6 +52,10 @@ class Schedule:
         if stage + 1 >= len(self.factors):
             return False
         return progress >= self.ends[stage] or bool(self.steps) and steps >= self.steps[stage]
+
+    def of_surfaces(self) -> Schedule:
+        """The same without sizes below a half, which surfaces that splats begin with are finer than."""
+        return replace(self, factors=self.factors[-2:], ends=self.ends[-2:], steps=self.steps[-1:])
 
     def grow_every(self, most: int) -> int:
         """Steps between two rounds of growth, at most ``most``: a short run has few steps before its last size, in which what

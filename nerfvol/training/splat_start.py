@@ -14,6 +14,7 @@ from nerfvol.config.training import Config
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.errors import InputError
 from nerfvol.kernels.splat_state import SplatState
+from nerfvol.octree.tree import Octree
 from nerfvol.region import SceneBounds
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.choose import STARTS, choose_start
@@ -21,6 +22,7 @@ from nerfvol.starts.cloud import splats_of_cloud
 from nerfvol.starts.subject import subject_of
 from nerfvol.starts.surfels import surfels
 from nerfvol.starts.visible import JUDGING_VIEWS, judged_downscale, largest_weights
+from nerfvol.training.field_phase import FIELD_SHARE
 from nerfvol.training.session import Run
 from nerfvol.training.splat_schedule import SECONDS_PER_STEP, Schedule, make_schedule, saved_schedule
 from nerfvol.training.splat_trainer import SplatTrainer
@@ -74,9 +76,13 @@ def make_schedule_of(run: Run, photographs: Photographs) -> Schedule:
             return saved_schedule(saved)
     left = run.seconds_left()
     share = start_share(run.data.training.scene) if config.representation == "octree" else 1.0
+    from_field = config.representation == "splats" and config.init == "mlp"
+    if from_field and left is not None:
+        left -= min(config.field.time_budget, FIELD_SHARE * left)
     seconds = settings_of(config).steps * SECONDS_PER_STEP if left is None else share * left
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
-    return make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
+    schedule = make_schedule(seconds, sizes, run.data.training.scene.is_unbounded, config.splats.max_splats)
+    return schedule.of_surfaces() if from_field else schedule
 
 
 @contextlib.contextmanager
@@ -88,8 +94,10 @@ def _saved_of(run: Run) -> Iterator[dict[str, Any]]:
         raise InputError(f"{run.checkpoint} does not fit the splats of this run: {error}") from error
 
 
-def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats, float]:
+def start_splats(run: Run, photographs: Photographs, most: int, octree: Octree | None = None) -> tuple[Splats, float]:
     """The splats to begin with, at most ``most`` of points; and the median camera's distance to the subject, scene units.
+
+    ``octree``: what a field was distilled to that they are to begin with; None: there is none.
 
     Raises:
         InputError: the start that ``init`` names is unknown or finds nothing.
@@ -99,6 +107,10 @@ def start_splats(run: Run, photographs: Photographs, most: int) -> tuple[Splats,
     if run.phase == "splats":  # the checkpoint has them
         with _saved_of(run) as saved:
             return SplatState.from_arrays(saved).splats(), float(saved["subject_distance"])
+    if octree is not None:
+        discs = _discs_on(run, octree, most).with_sh_degree(degree)
+        run.say(f"start: {discs.n:,} discs on what is seen of the {octree.n_leaves:,} leaves")
+        return discs, subject_of(dataset).distance
     init = "auto" if config.representation == "octree" else config.init
     if init not in ("auto", *STARTS):
         return _from_file(run, init, degree, most), subject_of(dataset).distance
@@ -119,9 +131,7 @@ def _from_file(run: Run, path: str, degree: int, most: int) -> Splats:
 
     model, config = load_model(path), run.config
     if isinstance(model, OctreeModel):
-        seen = run.data.training.evenly(2 * JUDGING_VIEWS)
-        weights = largest_weights(model.octree, seen, run.background, judged_downscale(seen))
-        splats = surfels(model.octree, weights, most, config.splats.mode)
+        splats = _discs_on(run, model.octree, most)
         run.say(f"start: {splats.n:,} discs on what is seen of the {model.octree.n_leaves:,} leaves of {path}")
         return splats.with_sh_degree(degree)
     if not isinstance(model, SplatModel):
@@ -131,3 +141,10 @@ def _from_file(run: Run, path: str, degree: int, most: int) -> Splats:
         raise InputError(f"--init {path}: it has {n:,} splats, expected 1 to {limit or 'any number':,}")
     run.say(f"start: the {n:,} splats of {path}")
     return run.data.frame.splats_into(model.splats.with_sh_degree(degree))
+
+
+def _discs_on(run: Run, octree: Octree, most: int) -> Splats:
+    """Discs, at most ``most``, on the leaves of ``octree`` that the training views see."""
+    seen = run.data.training.evenly(2 * JUDGING_VIEWS)
+    weights = largest_weights(octree, seen, run.background, judged_downscale(seen))
+    return surfels(octree, weights, most, run.config.splats.mode)

@@ -26,6 +26,7 @@ from nerfvol.splats.packing import LOGIT
 from nerfvol.splats.splats import Splats
 from nerfvol.splats.turn import similar
 from nerfvol.training.appearance import Appearance, fitting_factor
+from nerfvol.training.backgrounds import is_second
 from nerfvol.training.phase import RefinedPoses
 from nerfvol.training.splat_schedule import Schedule, saved_schedule
 from nerfvol.views import SplatModel
@@ -35,6 +36,9 @@ VIEWS, SPLITS = 3, 4
 NEAR_SHARE = 0.02
 """Of the subject's distance: what is nearer to a camera is not drawn."""
 SECONDS_TO_WRITE = 0.3
+SECOND_EVERY = 4
+"""Steps of which one is before the second background: a whole view tells of all that is open in it, and pictures before the
+first are what most people look at (with every second step these lose 0.1 to 0.8 dB more, docs/experiments.md)."""
 MOTION_PIXELS, MOTION_DECAY = 0.4, 0.1
 """Pixels of the present pictures by which a refined camera moves a visit, and the factor at the end: small pictures first,
 which see far, then fine ones."""
@@ -155,13 +159,14 @@ class SplatTrainer:
         if self.appearance.due(progress):
             self.fit_appearance(progress)
         index = self._next_view()
-        view = self.photographs.view(index, self.schedule.factors[self.stage])
+        second = is_second(self.photographs.second, self.steps_done, SECOND_EVERY)
+        view = self.photographs.view(index, self.schedule.factors[self.stage], second)
         near = NEAR_SHARE * self.subject_distance
         report = splat_ops.train_step(
             self.state,
             view_of(self._placed(index, view.camera), self.state.origin, near),
             self.appearance.corrected(index, view.image),
-            self._options(),
+            self._options(second),
             self._rates(progress),
             self.motions is not None,
         )
@@ -205,10 +210,11 @@ class SplatTrainer:
         random = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, VIEWS, epoch])))
         return int(random.permutation(len(self.photographs))[position])
 
-    def _options(self) -> SplatOptions:
+    def _options(self, second: bool) -> SplatOptions:
         c = self.config
         scale = c.scale / self.subject_distance
-        return SplatOptions(self.background, ssim=c.ssim or 0.0, scale=scale, early_stop_eps=c.early_stop_eps)
+        behind = self.photographs.second if self.photographs.second and second else self.background
+        return SplatOptions(behind, ssim=c.ssim or 0.0, scale=scale, early_stop_eps=c.early_stop_eps)
 
     def _rates(self, progress: float) -> SplatRates:
         c = self.config

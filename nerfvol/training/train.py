@@ -116,7 +116,7 @@ def _train(
         before = functools.partial(optimise, make_bar=bar)
         begin = {
             "octree": functools.partial(begin_octree, optimise=before),
-            "splats": begin_splats,
+            "splats": functools.partial(begin_splats, optimise=before),
             "field": begin_field,
             "medium": begin_medium,
         }
@@ -182,7 +182,7 @@ def finish(run: Run, trained: list[Model]) -> Results:
     frame = run.data.frame
     scores = affordable_scores(run, model, frame.dataset_back(run.data.held_out))
     counts = _counts(model)
-    row = {"seconds": seconds, "steps": run.steps[model.kind], "MB": written / 1e6, **counts}
+    row = {"seconds": seconds, "steps": run.steps[model.kind], "leaves": None, "MB": written / 1e6, **counts}
     if run.results:
         run.results["fine_tuned"] = row | summary(
             evaluate(model, frame.dataset_back(run.data.compared), run.background)

@@ -17,6 +17,7 @@ from nerfvol.machine import process_seconds
 from nerfvol.octree.tree import Octree
 from nerfvol.splats.splats import Splats
 from nerfvol.starts.subject import subject_of
+from nerfvol.training.backgrounds import second_background
 from nerfvol.training.convert import Say, surfaces_of
 from nerfvol.training.finishing import LARGEST_RESERVE, seconds_of_picture, seconds_to_score
 from nerfvol.training.octree_trainer import OctreeTrainer
@@ -67,14 +68,15 @@ def tuned_splats(
     splats: Splats, dataset: Dataset, background: Sequence[float], config: Config, scored: int = 0, say: Say = print
 ) -> SplatModel:
     """Splats trained further on photographs; as :func:`tuned_octree`."""
-    photographs = Photographs(dataset, background)
+    settings = config.for_few_views(len(dataset), dataset.scene).splats.for_scene(dataset.scene)
+    second = second_background(dataset, background, bool(settings.two_backgrounds))
+    photographs = Photographs(dataset, background, second=second)
     sizes = [(camera.intrinsics.width, camera.intrinsics.height) for camera in photographs.cameras]
     left = None if config.time_budget is None else max(config.time_budget - process_seconds(), 1.0)
     schedule = make_schedule(
         left or FINE_STEPS * SECONDS_PER_STEP, sizes, dataset.scene.is_unbounded, config.splats.max_splats
     )
     schedule = dataclasses.replace(schedule, most=max(schedule.most, splats.n))
-    settings = config.splats.for_scene(dataset.scene)
     splats = splats.with_sh_degree(settings.sh_degree or 0)
     distance = subject_of(dataset).distance
     trainer = SplatTrainer(photographs, splats, settings, schedule, distance, background, config.seed)

@@ -60,7 +60,7 @@ STILL = {f"rate_{name}": 0.0 for name in ("means", "scales", "quats", "logits", 
 def test_each_photograph_is_seen_once_an_epoch(monkeypatch):
     trainer = trainer_of(around(7), shell(around(7), 5), grow_every=4)
     seen, view = [], Photographs.view
-    monkeypatch.setattr(Photographs, "view", lambda self, i, factor: seen.append(i) or view(self, i, factor))
+    monkeypatch.setattr(Photographs, "view", lambda self, i, *how: seen.append(i) or view(self, i, *how))
     for k in range(28):
         trainer.step(k / 28)
     epochs = [tuple(seen[k : k + 7]) for k in (0, 7, 14, 21)]

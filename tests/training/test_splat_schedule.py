@@ -39,6 +39,23 @@ def test_stages_halve_down_to_the_whole_photographs_and_end_in_order():
         assert saved_schedule(state) == s
 
 
+def test_surfaces_begin_with_a_half():
+    """What splats begin with as surfaces is finer than smaller pictures; else the schedule is the same."""
+    for seconds, side, photographs, s in schedules():
+        of = s.of_surfaces()
+        assert of.factors == s.factors[-2:], f"{seconds} s, {side} pixels, photographs {photographs}"
+        assert (of.ends, of.steps) == (s.ends[-2:], s.steps[-1:] if len(s.factors) > 1 else ())
+        assert (of.most, of.grown) == (s.most, s.grown)
+        state = {
+            "factors": of.factors,
+            "ends": of.ends,
+            "most": of.most,
+            "grown": of.grown,
+            "steps_of_stages": of.steps,
+        }
+        assert saved_schedule(state) == of
+
+
 @pytest.mark.parametrize(
     "side, factors",
     [(1, (1,)), (24, (1,)), (199, (1,)), (200, (2, 1)), (399, (2, 1)), (400, (4, 2, 1)), (800, (8, 4, 2, 1)),

@@ -276,7 +276,7 @@ def test_which_representation_suits(alpha, init, expected):
 @pytest.mark.parametrize("views, alpha, given, start, tv", [
     (16, True, {}, "mlp", 3e-4), (17, True, {}, "auto", 6e-5), (16, False, {}, "auto", None),
     (8, True, {"init": "direct"}, "direct", 3e-4), (8, True, {"init": "mlp"}, "mlp", 3e-4),
-    (8, True, {"representation": "splats"}, "auto", 6e-5), (8, True, {"representation": "field"}, "auto", 6e-5),
+    (8, True, {"representation": "splats"}, "mlp", 3e-4), (8, True, {"representation": "field"}, "auto", 6e-5),
     (8, True, {"octree": OctreeConfig(tv_sh=0.5)}, "mlp", None),
     (8, True, {"time_budget": 10.0}, "auto", 3e-4), (8, True, {"time_budget": 11.0}, "mlp", 3e-4),
     (8, True, {"time_budget": 9.0, "init": "mlp"}, "mlp", 3e-4), (100, True, {"time_budget": 9.0}, "auto", 6e-5),
@@ -372,8 +372,8 @@ def test_a_run_goes_on_without_the_file_it_began_with(tmp_path, whole):
 
 
 @pytest.mark.parametrize("representation, init, reason", [
-    ("splats", "fog", "expected auto, points, .*random or a file of splats or an octree for splats, got 'fog'"),
-    ("splats", "mlp", "expected auto, points.* or a file of splats or an octree for splats, got 'mlp'"),
+    ("splats", "fog", "expected auto, mlp, points, .*random or a file of splats or an octree for splats, got 'fog'"),
+    ("splats", "direct", "expected auto, mlp, points.* or a file of splats or an octree for splats, got 'direct'"),
     ("octree", "sweep", "expected auto, direct, mlp, splats for octree, got 'sweep'"),
     ("octree", "FILE", "expected auto, direct, mlp, splats for octree, got '.*octree.safetensors'"),
     ("auto", "fog", "expected auto, direct, mlp, splats, points.* or a file of splats or an octree, got 'fog'"),

@@ -5,6 +5,7 @@ run really takes. One file for each representation: octree, splats, fields (a fi
 """
 
 from nerfvol.training.memory.base import gib as gib
+from nerfvol.training.memory.fields import field_backgrounds as field_backgrounds
 from nerfvol.training.memory.fields import field_memory as field_memory
 from nerfvol.training.memory.fields import medium_memory as medium_memory
 from nerfvol.training.memory.octree import OctreePlan as OctreePlan

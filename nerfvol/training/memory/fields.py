@@ -1,19 +1,36 @@
-"""The memory of a field and of a medium that are the product."""
+"""The memory of a field, as the product or as what another model begins with, and of a medium."""
 
 from __future__ import annotations
 
 from nerfvol.config.field import FieldConfig
 from nerfvol.config.medium import MediumConfig
+from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.defaults import WHITE
 from nerfvol.field.layout import layers_of
 from nerfvol.training.backgrounds import second_background
 from nerfvol.training.memory.base import BASE_BYTES, gib
 
+FIELD_BYTES = 310 << 20
+"""torch, the code that it compiles and what the training of a field leaves behind: measured."""
+DISTILL_BYTES = 290 << 20
+"""Next to the field, the images and their pixels over the background (3 bytes each): an octree of candidates before
+and after leaves were merged (0.9 million for lego)."""
 BYTES_PER_LIT_PIXEL = 28
 """Per training pixel of a medium: a ray (six float32) and four bytes."""
 BYTES_PER_LIT_SAMPLE = 80
 """Per step along a ray of a medium, looked up or not: position, thickness, transmittance, and what torch keeps of them."""
+
+
+def distillation_bytes(dataset: Dataset, backgrounds: int, held_out_bytes: int) -> int:
+    """Bytes, next to the program, while a field is trained and distilled: images, and their pixels before each background."""
+    pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
+    return dataset.nbytes + 3 * backgrounds * pixels + held_out_bytes + DISTILL_BYTES
+
+
+def field_backgrounds(config: Config, dataset: Dataset) -> int:
+    """The backgrounds, one or two, that a field sees the pictures of ``dataset`` before."""
+    return 1 + (second_background(dataset, WHITE, len(dataset) <= config.field.few_views) is not None)
 
 
 def field_memory(dataset: Dataset, config: FieldConfig, held_out_bytes: int) -> str:

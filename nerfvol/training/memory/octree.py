@@ -18,12 +18,8 @@ from nerfvol.octree.rows import BLOCKS
 from nerfvol.octree.tree import Octree
 from nerfvol.training.backgrounds import second_background
 from nerfvol.training.memory.base import BASE_BYTES, SHARE, gib
+from nerfvol.training.memory.fields import FIELD_BYTES, distillation_bytes
 
-FIELD_BYTES = 310 << 20
-"""torch, the code that it compiles and what the training of a field leaves behind: measured."""
-DISTILL_BYTES = 290 << 20
-"""Next to the field, the images and their pixels over the background (3 bytes each): an octree of candidates before
-and after leaves were merged (0.9 million for lego)."""
 LEAF_BYTES = 32 + 1 + 12 + 12 + 2
 """Per leaf: corners (8 int32), level (int8), position (3 int32), three float32 of statistics, a fifth of a node (10)."""
 VERTEX_BYTES = 4
@@ -133,7 +129,7 @@ def estimate_training(
         octree=octree,
         change=change,
         leaves=leaves,
-        distillation=dataset.nbytes + colours + other.held_out_bytes + DISTILL_BYTES if other.field else 0,
+        distillation=distillation_bytes(dataset, other.backgrounds, other.held_out_bytes) if other.field else 0,
         splats=other.splats,
     )
 

@@ -10,6 +10,7 @@ from nerfvol.datasets.photographs import Photographs, estimate_bytes
 from nerfvol.errors import InputError
 from nerfvol.machine import available_memory
 from nerfvol.training.memory.base import BASE_BYTES, SHARE, gib
+from nerfvol.training.memory.fields import FIELD_BYTES, distillation_bytes
 from nerfvol.training.splat_schedule import Schedule
 
 SURFACE_LEAVES_PER_SPLAT, SURFACE_LEAVES_PER_PIXEL, PHOTOGRAPH_SURFACE_LEAVES_PER_PIXEL = 32, 2.5, 10.0
@@ -40,7 +41,8 @@ def photographs_bytes(available: int | None = None) -> int | None:
 def photographs_held(dataset: Dataset, photographs: Photographs, factors: Sequence[int]) -> tuple[int, float]:
     """Bytes of the images of ``dataset`` and of all that ``photographs`` come to keep of them at the sizes 1 / ``factors``; and
     the share of what would be kept without their bound."""
-    wanted, most = estimate_bytes(photographs.cameras, factors), photographs.most_bytes
+    backgrounds = 1 + (photographs.second is not None)
+    wanted, most = backgrounds * estimate_bytes(photographs.cameras, factors), photographs.most_bytes
     kept = wanted if most is None else min(wanted, most)
     return dataset.nbytes + kept, kept / wanted
 
@@ -73,19 +75,31 @@ def surface_leaves(splats: int, view_pixels: int, photographs: bool = True) -> i
 
 
 def splat_memory(
-    dataset: Dataset, photographs: Photographs, schedule: Schedule, config: SplatConfig, held_out_bytes: int
+    dataset: Dataset,
+    photographs: Photographs,
+    schedule: Schedule,
+    config: SplatConfig,
+    held_out_bytes: int,
+    field_backgrounds: int = 0,
 ) -> str:
     """The estimate of training ``schedule.most`` splats, in words; InputError where that does not fit in the memory at hand.
 
-    The images of ``dataset`` and what ``photographs`` hold are there already.
+    The images of ``dataset`` and what ``photographs`` hold are there already. field_backgrounds: that the pictures are seen
+    before by a field that the splats begin with; 0: there is none.
     """
     held, kept = photographs_held(dataset, photographs, schedule.factors)
     images, splats = held + held_out_bytes, splat_bytes(schedule, config)
-    peak = BASE_BYTES + images + splats
+    base, field = BASE_BYTES, 0
+    if field_backgrounds:
+        base += FIELD_BYTES
+        field = photographs.nbytes + distillation_bytes(dataset, field_backgrounds, held_out_bytes)
+    peak = base + max(images + splats, field)
     part = "" if kept == 1 else f" ({kept:.0%} of the sizes; the others are made again for each step)"
+    before = "" if photographs.second is None else " before two backgrounds"
+    first = "" if not field else f", before that {gib(field)} to distil the field"
     sentence = (
-        f"{gib(peak)} at its peak: photographs and {len(schedule.factors)} sizes of them {gib(images)}{part}, up to "
-        f"{schedule.most:,} splats {gib(splats)}, the program {gib(BASE_BYTES)}"
+        f"{gib(peak)} at its peak: photographs and {len(schedule.factors)} sizes of them{before} {gib(images)}{part}, up to "
+        f"{schedule.most:,} splats {gib(splats)}, the program {gib(base)}{first}"
     )
     free, more = available_memory(), peak - dataset.nbytes - held_out_bytes - photographs.nbytes
     if free is not None and more > SHARE * free:
