@@ -12,6 +12,7 @@ from nerfvol.datasets.dataset import Dataset
 from nerfvol.errors import InputError
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.kernels.field_state import FieldState
+from nerfvol.native import native
 from nerfvol.region import SceneBounds
 from nerfvol.starts.field import distill
 from nerfvol.training import field_looks, field_schedule
@@ -208,6 +209,32 @@ def test_rays_are_the_cameras_and_colours_the_images(compiled, dataset: Dataset)
         assert len(np.unique(pixel)) > 150  # of 256: 500 draws hit 86 % of them
     assert 0 <= batch.jitter.min() and batch.jitter.max() < 1 and abs(batch.jitter.mean() - 0.5) < 5 * 0.289 / 63
     assert not np.array_equal(Pixels(dataset, background, 2).sample(4000, 3, 8).jitter, batch.jitter)
+
+
+def test_pixels_of_pictures_of_all_sizes(compiled) -> None:
+    """What is drawn belongs together, and every picture has its share: each number here tells its picture and pixel."""
+    kernels = native()
+    assert kernels is not None
+    sizes = [(1, 1), (70, 90), (3, 2), (1, 1), (8, 200), (5, 1)]
+    pictures, tables = [], []
+    for view, (height, width) in enumerate(sizes):
+        pixel = np.arange(height * width)
+        pictures.append(np.stack([np.full_like(pixel, view), pixel // 256, pixel % 256], 1).astype(np.uint8))
+        tables.append(np.stack([np.full_like(pixel, view), pixel, -pixel], 1).astype(np.float32))
+    rotations = np.tile(np.eye(3, dtype=np.float32), (len(sizes), 1, 1))
+    origins = np.repeat(np.arange(len(sizes), dtype=np.float32), 3).reshape(-1, 3)
+    shaped = [a.reshape(*size, 3) for a, size in zip(pictures, sizes, strict=True)]
+    n = 50_000
+    o, d, target = (np.empty((n, 3), np.float32) for _ in range(3))
+    kernels.field_draw(
+        kernels.FieldPixels(shaped, tables, rotations, origins), 5, o, d, target, np.empty(n, np.float32)
+    )
+    seen = np.rint(255 * target)
+    assert np.array_equal(seen[:, 0], o[:, 0]) and np.array_equal(seen[:, 0], d[:, 0])
+    assert np.array_equal(256 * seen[:, 1] + seen[:, 2], d[:, 1])
+    shares = np.array([height * width for height, width in sizes]) / sum(h * w for h, w in sizes)
+    drawn = np.bincount(o[:, 0].astype(int), minlength=len(sizes))
+    assert (np.abs(drawn - n * shares) < 5 * np.sqrt(n * shares)).all() and drawn.all()
 
 
 def test_few_views_have_no_view_dependence(compiled, dataset: Dataset) -> None:

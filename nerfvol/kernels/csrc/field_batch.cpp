@@ -65,7 +65,9 @@ void draw_pixels(const FieldPixels& from, uint64_t key, int64_t n, float* origin
         for (int64_t k = 0; k < count; ++k) {  // all are asked for before the first is waited for: pictures do not fit into a cache
             const uint64_t h = mixed(key + uint64_t(first + k) * 0x9E3779B97F4A7C15ull);
             const int64_t pixel = int64_t((h >> 32) * pixels >> 32);
-            const int64_t view = std::upper_bound(from.starts, from.starts + from.views + 1, pixel) - from.starts - 1;
+            int64_t view = int64_t((h >> 32) * uint64_t(from.views) >> 32);  // it is this one where pictures are of one size
+            while (pixel < from.starts[view]) --view;
+            while (pixel >= from.starts[view + 1]) ++view;
             const int64_t at = 3 * (pixel - from.starts[view]);
             places[k] = {h, view, from.directions[view] + at, from.colours[view] + at};
             __builtin_prefetch(places[k].direction);
