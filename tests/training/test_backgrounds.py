@@ -9,16 +9,17 @@ from nerfvol.config.field import FieldConfig
 from nerfvol.config.octree import OctreeConfig
 from nerfvol.config.splats import SplatConfig
 from nerfvol.config.training import Config
+from nerfvol.datasets.averages import composite_average
 from nerfvol.datasets.dataset import Dataset
-from nerfvol.datasets.images import composite_average
 from nerfvol.datasets.photographs import Photographs
 from nerfvol.starts.cloud import splats_of_cloud
 from nerfvol.starts.random import random_points
-from nerfvol.training import convert
+from nerfvol.training import tuning
 from nerfvol.training.backgrounds import farthest, second_background
 from nerfvol.training.compiled_field import CompiledFieldTrainer
 from nerfvol.training.field_phase import domain_of
-from nerfvol.training.memory import OctreePlan, photographs_held
+from nerfvol.training.memory.octree import OctreePlan
+from nerfvol.training.memory.splats import photographs_held
 from nerfvol.training.octree_trainer import OctreeTrainer
 from nerfvol.training.splat_schedule import Schedule
 from nerfvol.training.splat_trainer import SplatTrainer
@@ -170,8 +171,8 @@ def test_the_same_splats_resumed_after_an_odd_step(compiled, white_ball):
 @pytest.mark.parametrize("few, said, degree", [(16, None, 1), (4, None, 2), (16, False, 1)])
 def test_splats_that_a_conversion_trains_have_two(compiled, white_ball, monkeypatch, few, said, degree):
     seen: list[SplatTrainer] = []
-    monkeypatch.setattr(convert, "_run", lambda phase, *_: seen.append(phase))
+    monkeypatch.setattr(tuning, "_run", lambda phase, *_: seen.append(phase))
     config = Config(data="d", out="o", field=FieldConfig(few_views=few), splats=SplatConfig(two_backgrounds=said))
     splats = splat_trainer(white_ball, False).state.splats()
-    convert.tuned_splats(splats, white_ball, WHITE, config)
+    tuning.tuned_splats(splats, white_ball, WHITE, config)
     assert seen[0].photographs.second == (BLACK if said is None else None) and seen[0].config.sh_degree == degree

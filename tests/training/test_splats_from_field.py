@@ -12,10 +12,13 @@ from nerfvol.files import run_folder
 from nerfvol.files.checkpoint import load_checkpoint, save_checkpoint
 from nerfvol.native import native
 from nerfvol.region import SceneBounds
-from nerfvol.training import memory, octree_start, session, splat_schedule, train
+from nerfvol.training import begin, octree_start, session, splat_schedule
 from nerfvol.training.clock import Clock
+from nerfvol.training.memory.base import BASE_BYTES, gib
+from nerfvol.training.memory.fields import FIELD_BYTES, distillation_bytes
 from nerfvol.training.prepare import load_data
 from nerfvol.training.splat_start import make_schedule_of
+from nerfvol.training.train import optimise
 from tests.fixtures.runs import TINY, metrics_of, run_of, settings, start
 
 pytestmark = pytest.mark.skipif(native() is None, reason="the reference path takes minutes; it has a test of its own")
@@ -132,8 +135,8 @@ def test_memory_counts_the_field(tmp_path, tiny_scene):
     run.say = said.append
     training, kept = run.data.training, run.data.held_out_bytes
     with run:
-        train.begin_splats(run)
+        begin.begin_splats(run, optimise)
     announced = next(line for line in said if "memory: " in line)
-    field = memory.distillation_bytes(training, 2, kept)
-    assert f"before that {memory.gib(field)[:3]}" in announced
-    assert f"{memory.gib(memory.BASE_BYTES + memory.FIELD_BYTES + field)} at its peak" in announced
+    field = distillation_bytes(training, 2, kept)
+    assert f"before that {gib(field)[:3]}" in announced
+    assert f"{gib(BASE_BYTES + FIELD_BYTES + field)} at its peak" in announced
