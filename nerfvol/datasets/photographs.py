@@ -95,9 +95,8 @@ class Photographs:
             return undistorted(image, canvases[lens], *grids[lens]) if lens in grids else image
 
         self._make_source, self._images, self._most, self._lock = make, images, most_bytes, threading.Lock()
-        self._sources: list[UInt8 | None] = [None] * len(
-            images
-        )  # those before the second background come after the others
+        # Those before the second background come after the others.
+        self._sources: list[UInt8 | None] = [None] * len(images)
         self._bytes, self._full = 0, False
         map_threads(lambda key: None if self._full else self._source(key), range(len(images)), self._threads)
         wide = [c.intrinsics for c in dataset.cameras if canvases[c.intrinsics].cropped]

@@ -121,7 +121,7 @@ def begin_splats(run: Run, optimise: Optimise) -> SplatTrainer:
     for message in photographs.messages:
         run.say(message)
     schedule, kept = make_schedule_of(run, photographs), run.data.held_out_bytes
-    first = field_backgrounds(config, dataset) if config.init == "mlp" and run.phase != "splats" else 0
+    first = field_backgrounds(config.field, dataset) if config.init == "mlp" and run.phase != "splats" else 0
     announce(run, splat_memory(dataset, photographs, schedule, config.splats, kept, first))
     if config.init != run.given.init and (chosen := why_start(config, len(dataset))):
         run.say(chosen)

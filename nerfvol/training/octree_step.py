@@ -12,7 +12,8 @@ from nerfvol.kernels import ops
 BACKGROUND_STREAM = 2
 """Stream of random numbers of the random background of photographs; TileBank has 0 and 1."""
 BETA = 0.95
-"""Memory, per step, of RMSprop's second moments."""
+"""Memory, per step, of RMSprop's second moments: a vertex moves some fifty times in a minute, and 0.98 remembers as many
+(docs/experiments.md: +0.1 to 0.4 dB at equal steps)."""
 
 
 def losses_at(

@@ -143,29 +143,28 @@ def test_memory_counts_the_backgrounds_of_field_and_octree(white_ball, two, init
     assert plan._other.backgrounds == held
 
 
-def test_the_same_bits_resumed_after_an_odd_step(compiled, white_ball):
-    config = dataclasses.replace(OCTREE, two_backgrounds=True)
-    whole, first, second = (OctreeTrainer(white_ball, WHITE, config, 0) for _ in range(3))
+def six_steps_and_resumed_after_three(make):
+    """Two trainers after six steps: one made them at once, the other three of them from the state of a third."""
+    whole, first, resumed = make(), make(), make()
     for k in range(6):
         whole.step(k / 6)
     for k in range(3):
         first.step(k / 6)
-    second.load_state_dict(first.state_dict())
+    resumed.load_state_dict(first.state_dict())
     for k in range(3, 6):
-        second.step(k / 6)
-    assert whole.octree.values.tobytes() == second.octree.values.tobytes()
+        resumed.step(k / 6)
+    return whole, resumed
+
+
+def test_the_same_bits_resumed_after_an_odd_step(compiled, white_ball):
+    config = dataclasses.replace(OCTREE, two_backgrounds=True)
+    whole, resumed = six_steps_and_resumed_after_three(lambda: OctreeTrainer(white_ball, WHITE, config, 0))
+    assert whole.octree.values.tobytes() == resumed.octree.values.tobytes()
 
 
 def test_the_same_splats_resumed_after_an_odd_step(compiled, white_ball):
-    whole, first, second = (splat_trainer(white_ball, True) for _ in range(3))
-    for k in range(6):
-        whole.step(k / 6)
-    for k in range(3):
-        first.step(k / 6)
-    second.load_state_dict(first.state_dict())
-    for k in range(3, 6):
-        second.step(k / 6)
-    assert whole.state.params.tobytes() == second.state.params.tobytes()
+    whole, resumed = six_steps_and_resumed_after_three(lambda: splat_trainer(white_ball, True))
+    assert whole.state.params.tobytes() == resumed.state.params.tobytes()
 
 
 @pytest.mark.parametrize("few, said, degree", [(16, None, 1), (4, None, 2), (16, False, 1)])

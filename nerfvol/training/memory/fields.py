@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from nerfvol.config.field import FieldConfig
 from nerfvol.config.medium import MediumConfig
-from nerfvol.config.training import Config
 from nerfvol.datasets.dataset import Dataset
 from nerfvol.defaults import WHITE
 from nerfvol.field.layout import layers_of
@@ -28,17 +27,18 @@ def distillation_bytes(dataset: Dataset, backgrounds: int, held_out_bytes: int) 
     return dataset.nbytes + 3 * backgrounds * pixels + held_out_bytes + DISTILL_BYTES
 
 
-def field_backgrounds(config: Config, dataset: Dataset) -> int:
+def field_backgrounds(config: FieldConfig, dataset: Dataset) -> int:
     """The backgrounds, one or two, that a field sees the pictures of ``dataset`` before."""
-    return 1 + (second_background(dataset, WHITE, len(dataset) <= config.field.few_views) is not None)
+    return 1 + (second_background(dataset, WHITE, len(dataset) <= config.few_views) is not None)
 
 
 def field_memory(dataset: Dataset, config: FieldConfig, held_out_bytes: int) -> str:
     """The estimate of training a field that is the product, in words."""
     shape = config.shape
     pixels = sum(camera.intrinsics.width * camera.intrinsics.height for camera in dataset.cameras)
-    backgrounds = 1 + (second_background(dataset, WHITE, len(dataset) <= config.few_views) is not None)
-    images = dataset.nbytes + 3 * backgrounds * pixels // min(config.downscales) ** 2 + held_out_bytes
+    images = (
+        dataset.nbytes + 3 * field_backgrounds(config, dataset) * pixels // min(config.downscales) ** 2 + held_out_bytes
+    )
     entries = shape.hash_levels * shape.hash_features << shape.log2_table if shape.encoding == "hash" else 0
     network = sum(layer.numbers for layer in layers_of(shape))
     field = 4 * 4 * (entries + network) + 4 * config.grid_resolution**3 * (1 + dataset.scene.n_shells)
